@@ -1,0 +1,230 @@
+"""One root error; each leaf has a stable code, and one table gives it its HTTP status (RFC 9457).
+
+``SpecimapError`` carries a message (what is wrong), an advice (what to do) and details (JSON values that a
+program can use). A leaf also is the builtin that fits, so that ``except FileNotFoundError`` works.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+
+class SpecimapError(Exception):
+    """Root of all errors that Specimap raises on purpose."""
+
+    code: ClassVar[str] = "internal_error"
+
+    def __init__(self, message: str, *, advice: str = "", **details: object) -> None:
+        super().__init__(message)
+        self.message = message
+        self.advice = advice
+        self.details = details
+
+    def __str__(self) -> str:
+        return f"{self.message} {self.advice}".strip()
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # Keyword-only arguments do not survive the default pickling, and workers pass errors on.
+        return (_rebuild, (type(self), self.message, self.advice, self.details))
+
+    def as_dict(self) -> dict[str, object]:
+        """Code, message, advice and details as JSON-ready values."""
+        return {"code": self.code, "message": self.message, "advice": self.advice, "details": self.details}
+
+
+def _rebuild(
+    leaf: type[SpecimapError], message: str, advice: str, details: dict[str, object]
+) -> SpecimapError:
+    return leaf(message, advice=advice, **details)
+
+
+# ---- photos -------------------------------------------------------------------------------------------
+
+
+class PhotoUnreadableError(SpecimapError, ValueError):
+    """A photo does not decode: not an image, truncated, or too large."""
+
+    code = "photo_unreadable"
+
+
+class TooFewPhotosError(SpecimapError, ValueError):
+    """Fewer photos than the minimum, as given or after refusing some."""
+
+    code = "too_few_photos"
+
+
+class PhotosNotConnectedError(SpecimapError, ValueError):
+    """The photos fall into groups that share nothing: two scenes."""
+
+    code = "photos_not_connected"
+
+
+class DepthNotFoundError(SpecimapError, ValueError):
+    """No pair of photos gave a surface."""
+
+    code = "depth_not_found"
+
+
+# ---- markers ------------------------------------------------------------------------------------------
+
+
+class NoMarkersFoundError(SpecimapError, ValueError):
+    """No photo shows a marker of the dictionary."""
+
+    code = "no_markers_found"
+
+
+class WrongDictionaryError(NoMarkersFoundError):
+    """Markers are seen, but they belong to another dictionary, which is named."""
+
+    code = "marker_dictionary_wrong"
+
+
+class UnknownDictionaryError(SpecimapError, ValueError):
+    """The named dictionary does not exist."""
+
+    code = "marker_dictionary_unknown"
+
+
+class DuplicateMarkersError(SpecimapError, ValueError):
+    """One id stands on several markers."""
+
+    code = "marker_ids_duplicate"
+
+
+class MarkersMissingInCubeError(SpecimapError, ValueError):
+    """Fewer than two markers that the photos know show in the cube."""
+
+    code = "markers_missing_in_cube"
+
+
+class MarkerGeometryError(SpecimapError, ValueError):
+    """The markers seen do not determine the cameras."""
+
+    code = "marker_geometry_unsolvable"
+
+
+class EdgeLengthError(SpecimapError, ValueError):
+    """The given marker edge contradicts what else is known of the scale."""
+
+    code = "marker_edge_wrong"
+
+
+# ---- cube ---------------------------------------------------------------------------------------------
+
+
+class CubeHeaderError(SpecimapError, ValueError):
+    """A header field is missing or wrong; ``details['field']`` names it."""
+
+    code = "cube_header_invalid"
+
+
+class CubeTruncatedError(SpecimapError, ValueError):
+    """The data are shorter than the header says; details hold expected and found bytes."""
+
+    code = "cube_truncated"
+
+
+class CubeNotFoundError(SpecimapError, FileNotFoundError):
+    """The cube, or the data beside its header, does not exist."""
+
+    code = "cube_not_found"
+
+
+class CubeFormatError(SpecimapError, ValueError):
+    """The file is of no known cube format, or holds no cube."""
+
+    code = "cube_format_unknown"
+
+
+class CubeContentError(SpecimapError, ValueError):
+    """The cube reads, but holds nothing usable: no finite or no varying values, or a mismatching reference."""
+
+    code = "cube_content_invalid"
+
+
+class CubeMirroredError(SpecimapError, ValueError):
+    """The markers in the cube decode only in a mirror."""
+
+    code = "cube_mirrored"
+
+
+class RegistrationError(SpecimapError, ValueError):
+    """The cube's camera cannot be solved, or its rays miss the surface."""
+
+    code = "registration_failed"
+
+
+# ---- the program --------------------------------------------------------------------------------------
+
+
+class SettingsError(SpecimapError, ValueError):
+    """A setting is out of its range; ``details['setting']`` names it."""
+
+    code = "setting_invalid"
+
+
+class BackendUnavailableError(SpecimapError, RuntimeError):
+    """The backend, or a library or weights file it needs, is not there."""
+
+    code = "backend_unavailable"
+
+
+class OutputExistsError(SpecimapError, FileExistsError):
+    """The output folder holds something that Specimap did not write."""
+
+    code = "output_exists"
+
+
+class OutputNotWritableError(SpecimapError, PermissionError):
+    """The output folder cannot be written."""
+
+    code = "output_not_writable"
+
+
+class StorageFullError(SpecimapError, OSError):
+    """The disk filled up; nothing half-written remains."""
+
+    code = "storage_full"
+
+
+class NotFoundError(SpecimapError, FileNotFoundError):
+    """What was asked for is not there."""
+
+    code = "not_found"
+
+
+class CancelledError(SpecimapError, RuntimeError):
+    """The run was cancelled; finished stages are kept."""
+
+    code = "cancelled"
+
+
+HTTP_STATUS: dict[type[SpecimapError], int] = {
+    SpecimapError: 500,
+    BackendUnavailableError: 503,
+    CancelledError: 409,
+    CubeContentError: 422,
+    CubeFormatError: 415,
+    CubeHeaderError: 422,
+    CubeMirroredError: 422,
+    CubeNotFoundError: 404,
+    CubeTruncatedError: 422,
+    DepthNotFoundError: 422,
+    DuplicateMarkersError: 422,
+    EdgeLengthError: 422,
+    MarkerGeometryError: 422,
+    MarkersMissingInCubeError: 422,
+    NoMarkersFoundError: 422,
+    NotFoundError: 404,
+    OutputExistsError: 409,
+    OutputNotWritableError: 500,
+    PhotoUnreadableError: 422,
+    PhotosNotConnectedError: 422,
+    RegistrationError: 422,
+    SettingsError: 422,
+    StorageFullError: 507,
+    TooFewPhotosError: 422,
+    UnknownDictionaryError: 422,
+    WrongDictionaryError: 422,
+}
