@@ -138,7 +138,7 @@ class CubeFormatError(SpecimapError, ValueError):
 
 
 class CubeContentError(SpecimapError, ValueError):
-    """The cube reads, but holds nothing usable: no finite or no varying values, or a mismatching reference."""
+    """The cube reads, but holds nothing usable: no finite or varying values, or a reference that does not fit."""
 
     code = "cube_content_invalid"
 

@@ -1,0 +1,283 @@
+"""Poses from the markers alone: a start from single squares, then one least squares over everything.
+
+Each marker gives two poses per photo (IPPE, Collins and Bartoli 2014). Of the two, the one is taken whose normal
+the photo's other markers share; photos and markers are chained from the marker seen most. The focal length is
+unknown: several starts, the lowest cost wins.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from specimap.core.errors import MarkerGeometryError, PhotosNotConnectedError
+from specimap.core.geometry import Floats, Intrinsics, Pose, rotation_from_vector
+from specimap.core.solver import MarkerScene, Observations, SolveInfo, corners_of, solve, square_corners
+
+FOCAL_STARTS = (0.8, 1.2, 1.8)
+"""Starts for an unknown focal length, in longer sides of the photo (measured: one start in three fails)."""
+OUTLIER_PX = 6.0
+"""Floor of the distance at which a marker in a photo is called foreign to the rest."""
+
+
+@dataclass(frozen=True)
+class MarkerSolution:
+    """Stage 1's answer from markers.
+
+    ``photos`` and ``markers``: the indices and ids that ``scene``'s poses and corners belong to. ``weak``:
+    photos posed by a single marker whose two poses fit almost alike, with the other pose. ``foreign``: photos
+    that contradict the rest, by their RMS in pixels.
+    """
+
+    scene: MarkerScene
+    info: SolveInfo
+    seen: Observations
+    photos: tuple[int, ...]
+    markers: tuple[int, ...]
+    weak: dict[int, Pose]
+    foreign: dict[int, float]
+
+
+def solve_from_markers(
+    seen: Observations,
+    marker_ids: tuple[int, ...],
+    size: tuple[int, int],
+    *,
+    edge_mm: float,
+    focal_px: float | None = None,
+) -> MarkerSolution:
+    """Pose all photos that show a marker, without calibration.
+
+    Args:
+        seen: ``photo`` indexes the caller's photos; ``marker`` indexes ``marker_ids``.
+        size: width, height of the photos in pixels.
+        focal_px: from EXIF, where there is one; used as a start and a weak prior.
+
+    Raises:
+        PhotosNotConnectedError: photos fall into groups that share no marker.
+        MarkerGeometryError: no start leads to a consistent set of cameras.
+    """
+    longer = max(size)
+    starts = [focal_px] if focal_px else [s * longer for s in FOCAL_STARTS]
+    best: MarkerSolution | None = None
+    for start in starts:
+        solution = _solve_start(seen, marker_ids, Intrinsics.centred(*size, start), edge_mm, focal_px)
+        if best is None or _rank(solution) < _rank(best):
+            best = solution
+    assert best is not None
+    limit = max(OUTLIER_PX, 0.004 * longer)
+    if best.info.rms_after_px > 2 * limit:
+        raise MarkerGeometryError(
+            f"The markers do not fit together: {best.info.rms_after_px:.1f} px remain.",
+            advice="Photograph one unmoved scene with one camera, each marker once, and print markers undistorted.",
+            rms_px=best.info.rms_after_px,
+        )
+    return best
+
+
+def _rank(solution: MarkerSolution) -> tuple[int, float]:
+    return len(solution.foreign), solution.info.cost
+
+
+def _solve_start(
+    seen: Observations,
+    marker_ids: tuple[int, ...],
+    lens: Intrinsics,
+    edge_mm: float,
+    focal_prior: float | None,
+) -> MarkerSolution:
+    choices = _two_poses(seen, lens, edge_mm)
+    picked = _agreeing(seen, choices)
+    poses, squares = _chain(seen, picked, len(marker_ids))
+    photos, markers = tuple(sorted(poses)), tuple(sorted(squares))
+    inner = _reindexed(seen, photos, markers)
+    world = tuple(squares[m] for m in markers)
+    scene = MarkerScene(lens, tuple(poses[p] for p in photos), corners_of(world, edge_mm), world)
+    scene, info = solve(
+        scene, inner, edge_mm=edge_mm, refine_lens=True, focal_prior_px=focal_prior, iterations=60
+    )
+    # A photo whose flipped pose fits the solved markers better is turned over; then once more from there.
+    scene, weak = _unflip(scene, inner, edge_mm)
+    scene, info = solve(
+        scene, inner, edge_mm=edge_mm, refine_lens=True, focal_prior_px=focal_prior, iterations=60
+    )
+    residual = np.sqrt((scene.residuals(inner) ** 2).sum(-1).mean(1))
+    limit = max(OUTLIER_PX, 5 * float(np.median(residual)))
+    foreign: dict[int, float] = {}
+    for k in range(len(photos)):
+        own = residual[inner.photo == k]
+        if np.median(own) > limit:
+            foreign[photos[k]] = float(np.median(own))
+    keep = np.array([photos[p] not in foreign for p in inner.photo]) & (residual <= limit)
+    if foreign or not keep.all():
+        scene, info, inner, photos, markers = _without(
+            scene, inner, keep, photos, markers, edge_mm, focal_prior
+        )
+    ids = tuple(marker_ids[m] for m in markers)
+    return MarkerSolution(
+        scene, info, inner, photos, ids, {photos[p]: pose for p, pose in weak.items() if p < len(photos)}
+        if not foreign else {}, foreign,
+    )  # fmt: skip
+
+
+def _without(
+    scene: MarkerScene,
+    seen: Observations,
+    keep: np.ndarray[tuple[int, ...], np.dtype[np.bool_]],
+    photos: tuple[int, ...],
+    markers: tuple[int, ...],
+    edge_mm: float,
+    focal_prior: float | None,
+) -> tuple[MarkerScene, SolveInfo, Observations, tuple[int, ...], tuple[int, ...]]:
+    """Solve again without the observations that contradict the rest."""
+    rest = seen.of(keep)
+    if not len(rest.photo):
+        raise MarkerGeometryError(
+            "No two photos agree on where the markers are.",
+            advice="Photograph one unmoved scene; check that each marker id is used once.",
+        )
+    used_p, used_m = np.unique(rest.photo), np.unique(rest.marker)
+    inner = _reindexed(rest, tuple(used_p), tuple(used_m))
+    squares = tuple(scene.squares[m] for m in used_m) if scene.squares else ()
+    start = MarkerScene(
+        scene.lens, tuple(scene.poses[p] for p in used_p), corners_of(squares, edge_mm), squares
+    )
+    solved, info = solve(start, inner, edge_mm=edge_mm, refine_lens=True, focal_prior_px=focal_prior)
+    return solved, info, inner, tuple(photos[p] for p in used_p), tuple(markers[m] for m in used_m)
+
+
+def _reindexed(seen: Observations, photos: tuple[int, ...], markers: tuple[int, ...]) -> Observations:
+    p = {int(v): k for k, v in enumerate(photos)}
+    m = {int(v): k for k, v in enumerate(markers)}
+    return Observations(
+        np.array([p[int(v)] for v in seen.photo]),
+        np.array([m[int(v)] for v in seen.marker]),
+        seen.corners_px,
+        seen.sigma_px,
+    )
+
+
+def square_poses(corners_px: Floats, lens: Intrinsics, edge_mm: float) -> list[tuple[Pose, float]]:
+    """The two poses ``cam_from_marker`` of a square with corners (4, 2), with their RMS in pixels, best first."""
+    _, rvecs, tvecs, errors = cv2.solvePnPGeneric(
+        square_corners(edge_mm), corners_px.reshape(4, 1, 2), lens.matrix, lens.distortion,
+        flags=cv2.SOLVEPNP_IPPE_SQUARE,
+    )  # fmt: skip
+    found = [
+        (Pose(rotation_from_vector(r.ravel()), t.ravel()), float(e))
+        for r, t, e in zip(rvecs, tvecs, errors.ravel(), strict=True)
+        if np.isfinite(r).all() and np.isfinite(t).all()
+    ]
+    return sorted(found, key=lambda pair: pair[1])
+
+
+def _two_poses(seen: Observations, lens: Intrinsics, edge_mm: float) -> list[list[tuple[Pose, float]]]:
+    return [square_poses(c, lens, edge_mm) for c in seen.corners_px]
+
+
+def _agreeing(seen: Observations, choices: list[list[tuple[Pose, float]]]) -> list[Pose | None]:
+    """Per observation the pose whose normal the photo's other markers share; alone, the better fitting one."""
+    picked: list[Pose | None] = [None] * len(choices)
+    for photo in np.unique(seen.photo):
+        rows = np.flatnonzero(seen.photo == photo)
+        options = [(k, pose, e) for k in rows for pose, e in choices[k]]
+        if not options:
+            continue
+        normals = np.stack([pose.R[:, 2] for _, pose, _ in options])
+        owner = np.array([k for k, _, _ in options])
+        misfit = 1 - normals @ normals.T
+        totals = np.array([sum(misfit[i][owner == k].min() for k in set(owner)) for i in range(len(options))])
+        # One marker alone leaves a tie, which the fit decides.
+        leader = int(np.argmin(totals + 1e-3 * np.array([e for _, _, e in options])))
+        for k in set(owner):
+            mine = np.flatnonzero(owner == k)
+            picked[k] = options[mine[int(np.argmin(misfit[leader][mine]))]][1]
+    return picked
+
+
+def _chain(
+    seen: Observations, picked: list[Pose | None], marker_count: int
+) -> tuple[dict[int, Pose], dict[int, Pose]]:
+    """Walk from the marker seen most over the photos to all others; averages are left to the least squares."""
+    by_photo: dict[int, list[int]] = defaultdict(list)
+    for k, photo in enumerate(seen.photo):
+        if picked[k] is not None:
+            by_photo[int(photo)].append(k)
+    counts = np.bincount(seen.marker, minlength=marker_count)
+    squares = {int(counts.argmax()): Pose(np.eye(3), np.zeros(3))}
+    poses: dict[int, Pose] = {}
+    while True:
+        reachable = [
+            (sum(int(seen.marker[k]) in squares for k in rows), len(rows), photo)
+            for photo, rows in by_photo.items()
+            if photo not in poses and any(int(seen.marker[k]) in squares for k in rows)
+        ]
+        if not reachable:
+            break
+        _, _, photo = max(reachable)
+        known = [k for k in by_photo[photo] if int(seen.marker[k]) in squares]
+        candidates = [_required(picked[k]) @ squares[int(seen.marker[k])].inverse() for k in known]
+        pose = _medoid(candidates)
+        poses[photo] = pose
+        for k in by_photo[photo]:
+            squares.setdefault(int(seen.marker[k]), pose.inverse() @ _required(picked[k]))
+    lost = sorted(set(by_photo) - set(poses))
+    if lost:
+        raise PhotosNotConnectedError(
+            f"{len(lost)} of {len(by_photo)} photos show no marker that the others show: they are of another scene.",
+            advice="Remove the foreign photos, or take photos that show markers of both groups.",
+            photos=lost,
+        )
+    return poses, squares
+
+
+def _required(pose: Pose | None) -> Pose:
+    assert pose is not None
+    return pose
+
+
+def _medoid(candidates: list[Pose]) -> Pose:
+    centres = np.stack([c.centre for c in candidates])
+    turns = np.stack([c.R for c in candidates])
+    far = np.linalg.norm(centres[:, None] - centres[None], axis=-1) / (
+        1e-9 + np.linalg.norm(centres, axis=-1).mean()
+    )
+    cosine = (np.einsum("aij,bij->ab", turns, turns) - 1) / 2
+    return candidates[int((far + 1 - cosine).sum(1).argmin())]
+
+
+def _unflip(
+    scene: MarkerScene, seen: Observations, edge_mm: float
+) -> tuple[MarkerScene, dict[int, Pose]]:
+    """Give each photo the pose, among those its single squares offer, that fits all it sees best.
+
+    Returns the scene and the photos that show one marker only and whose other pose fits almost as well.
+    """
+    assert scene.squares is not None
+    poses = list(scene.poses)
+    weak: dict[int, Pose] = {}
+    for p in range(len(poses)):
+        mine = seen.of(seen.photo == p)
+        world = scene.corners[mine.marker]
+        options = [poses[p]]
+        for corners_px, marker in zip(mine.corners_px, mine.marker, strict=True):
+            inverse = scene.squares[int(marker)].inverse()
+            options += [pose @ inverse for pose, _ in square_poses(corners_px, scene.lens, edge_mm)]
+        costs = []
+        for option in options:
+            miss = scene.lens.project(option.apply(world)) - mine.corners_px
+            costs.append(float(np.median(np.sqrt((miss**2).sum(-1)))) if np.isfinite(miss).all() else np.inf)
+        best = int(np.argmin(costs))
+        if costs[best] < 0.9 * costs[0]:
+            poses[p] = options[best]
+        if len(mine.marker) == 1 and len(options) > 2:
+            away = [
+                k for k in range(1, len(options))
+                if np.trace(options[k].R.T @ poses[p].R) < 2.9 and costs[k] < 4 * costs[best] + 0.3
+            ]  # fmt: skip
+            if away:
+                weak[p] = options[min(away, key=lambda k: costs[k])]
+    return MarkerScene(scene.lens, tuple(poses), scene.corners, scene.squares), weak

@@ -1,0 +1,281 @@
+"""The least squares behind stages 1 and 2: cameras and markers from marker corners, and its covariance.
+
+Unknowns: a shared lens (focal length, principal point, two radial terms), a pose per photo, and the markers,
+either rigid squares of known edge (a pose each) or four free points each. Derivatives are analytic; the normal
+equations are dense, since a marker is seen by most photos. Robustness is by reweighting (Huber 1964 on whole
+markers' corners); Levenberg-Marquardt damping also takes care of the free choice of frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specimap.core.geometry import Floats, Intrinsics, Pose, rotation_from_vector, skew
+
+Ints = NDArray[np.int64]
+
+LENS = 5  # log focal length, cx, cy, k1, k2
+PRIOR_FOCAL = 0.05
+"""Standard deviation of the logarithm of a focal length that EXIF states."""
+PRIOR_CENTRE = 0.006
+"""Standard deviation of the principal point about the image's centre, as a share of the width."""
+PRIOR_RADIAL = (0.1, 0.1)
+HUBER = 2.5
+"""Residuals beyond this many standard deviations lose weight."""
+
+
+@dataclass(frozen=True)
+class Observations:
+    """M markers seen in photos.
+
+    ``photo`` and ``marker`` (M,): indices; ``corners_px`` (M, 4, 2); ``sigma_px`` (M,) of a coordinate.
+    """
+
+    photo: Ints
+    marker: Ints
+    corners_px: Floats
+    sigma_px: Floats
+
+    def of(self, keep: NDArray[np.bool_]) -> Observations:
+        """Those where ``keep`` (M,) is true."""
+        return Observations(self.photo[keep], self.marker[keep], self.corners_px[keep], self.sigma_px[keep])
+
+
+@dataclass(frozen=True)
+class MarkerScene:
+    """A state of the unknowns: one lens, P photo poses, and the corners (Q, 4, 3) of Q markers.
+
+    ``squares``: poses ``world_from_marker`` of the markers where they are rigid, else None.
+    """
+
+    lens: Intrinsics
+    poses: tuple[Pose, ...]
+    corners: Floats
+    squares: tuple[Pose, ...] | None
+
+    def residuals(self, seen: Observations) -> Floats:
+        """Projected minus measured corners, (M, 4, 2) pixels."""
+        R = np.stack([p.R for p in self.poses])[seen.photo]
+        t = np.stack([p.t for p in self.poses])[seen.photo]
+        cam = np.einsum("mij,mcj->mci", R, self.corners[seen.marker]) + t[:, None]
+        return self.lens.project(cam) - seen.corners_px
+
+
+@dataclass(frozen=True)
+class SolveInfo:
+    """How a solution was reached: iterations, final robust cost, RMS in pixels before and after (unweighted
+    corner distance), weights (M,) that the robust loss left, and the normal matrix of all unknowns."""
+
+    iterations: int
+    cost: float
+    rms_before_px: float
+    rms_after_px: float
+    weights: Floats
+    normal: Floats
+
+
+def square_corners(edge_mm: float) -> Floats:
+    """Corners (4, 3) of a marker in its own frame: x right, y up, z out of the print; origin at its centre."""
+    h = edge_mm / 2
+    return np.array([[-h, h, 0], [h, h, 0], [h, -h, 0], [-h, -h, 0]])
+
+
+def rms_px(residuals: Floats) -> float:
+    """Root of the mean squared corner distance of residuals (M, 4, 2)."""
+    return float(np.sqrt((residuals**2).sum(-1).mean()))
+
+
+def solve(
+    scene: MarkerScene,
+    seen: Observations,
+    *,
+    edge_mm: float,
+    refine_lens: bool,
+    robust: bool = True,
+    focal_prior_px: float | None = None,
+    iterations: int = 60,
+) -> tuple[MarkerScene, SolveInfo]:
+    """Minimise the weighted reprojection error.
+
+    Rigid where ``scene.squares`` is given (millimetres follow from ``edge_mm``), else free corners, whose scale
+    stays as it is. With ``refine_lens`` false the lens is fixed, as published.
+    """
+    before = rms_px(scene.residuals(seen))
+    prior_focal = focal_prior_px or scene.lens.focal_px
+    focal_sd = PRIOR_FOCAL if focal_prior_px else 10.0
+    damping, cost = 1e-4, np.inf
+    H, g, cost, weights = _normal_equations(scene, seen, edge_mm, refine_lens, robust, prior_focal, focal_sd)
+    done = 0
+    for done in range(1, iterations + 1):
+        diagonal = np.diag(H).copy()
+        step = np.linalg.solve(H + np.diag(damping * diagonal + 1e-12), -g)
+        moved = _apply(scene, step, edge_mm, refine_lens)
+        trial = _normal_equations(moved, seen, edge_mm, refine_lens, robust, prior_focal, focal_sd)
+        if trial[2] < cost:
+            gain = cost - trial[2]
+            scene, (H, g, cost, weights) = moved, trial
+            damping = max(damping / 5, 1e-9)
+            if gain < 1e-7 * cost:
+                break
+        else:
+            damping *= 8
+            if damping > 1e8:
+                break
+    after = rms_px(scene.residuals(seen))
+    return scene, SolveInfo(done, cost, before, after, weights, H)
+
+
+def _normal_equations(
+    scene: MarkerScene,
+    seen: Observations,
+    edge_mm: float,
+    refine_lens: bool,
+    robust: bool,
+    prior_focal: float,
+    focal_sd: float,
+) -> tuple[Floats, Floats, float, Floats]:
+    lens, poses = scene.lens, scene.poses
+    P, Q = len(poses), len(scene.corners)
+    size = 12 if scene.squares is None else 6
+    M = len(seen.photo)
+    Rp = np.stack([p.R for p in poses])[seen.photo]
+    tp = np.stack([p.t for p in poses])[seen.photo]
+    X = scene.corners[seen.marker]
+    turned = np.einsum("mij,mcj->mci", Rp, X)
+    cam = turned + tp[:, None]
+    residual, d_cam, d_lens = _projection(lens, cam, seen.corners_px)
+    sigma = seen.sigma_px[:, None, None]
+    # per observation: 8 rows; columns lens | photo (6) | marker (size)
+    J_photo = np.concatenate([-d_cam @ skew(turned), d_cam], -1)  # left perturbation of the rotation
+    d_point = np.einsum("mcij,mjk->mcik", d_cam, Rp)
+    if scene.squares is None:
+        J_marker = np.zeros((M, 4, 2, 12))
+        for c in range(4):
+            J_marker[:, c, :, 3 * c : 3 * c + 3] = d_point[:, c]
+    else:
+        Rm = np.stack([s.R for s in scene.squares])[seen.marker]
+        arm = np.einsum("mij,cj->mci", Rm, square_corners(edge_mm))
+        J_marker = np.concatenate([-d_point @ skew(arm), d_point], -1)
+    norm = np.sqrt((residual**2).sum(-1)) / sigma[..., 0]
+    weights = np.minimum(1.0, HUBER / np.maximum(norm, 1e-12)) if robust else np.ones_like(norm)
+    cost = float((np.where(norm < HUBER, norm**2, 2 * HUBER * norm - HUBER**2) if robust else norm**2).sum())
+    root = (np.sqrt(weights) / sigma[..., 0])[..., None]
+    r = (residual * root).reshape(M, 8)
+    Jl = (d_lens * root[..., None]).reshape(M, 8, LENS)
+    Jp = (J_photo * root[..., None]).reshape(M, 8, 6)
+    Jm = (J_marker * root[..., None]).reshape(M, 8, size)
+    offset_m = LENS + 6 * P
+    n = offset_m + size * Q
+    H, g = np.zeros((n, n)), np.zeros(n)
+    J = np.concatenate([Jl, Jp, Jm], -1)
+    blocks = np.einsum("mri,mrj->mij", J, J)
+    gradient = np.einsum("mri,mr->mi", J, r)
+    for k in range(M):
+        p, m = LENS + 6 * int(seen.photo[k]), offset_m + size * int(seen.marker[k])
+        columns = np.r_[0:LENS, p : p + 6, m : m + size]
+        H[np.ix_(columns, columns)] += blocks[k]
+        g[columns] += gradient[k]
+    deviation = np.array(
+        [
+            np.log(lens.focal_px / prior_focal),
+            lens.cx - (lens.width - 1) / 2,
+            lens.cy - (lens.height - 1) / 2,
+            lens.k1,
+            lens.k2,
+        ]
+    )
+    sd = np.array([focal_sd, PRIOR_CENTRE * lens.width, PRIOR_CENTRE * lens.width, *PRIOR_RADIAL])
+    if refine_lens:
+        H[range(LENS), range(LENS)] += 1 / sd**2
+        g[:LENS] += deviation / sd**2
+        cost += float(((deviation / sd) ** 2).sum())
+    else:
+        H[:LENS], H[:, :LENS], g[:LENS] = 0, 0, 0
+        H[range(LENS), range(LENS)] = 1.0
+    return H, g, cost, weights.mean(1)
+
+
+def _projection(lens: Intrinsics, cam: Floats, measured: Floats) -> tuple[Floats, Floats, Floats]:
+    """Residual (M, 4, 2), its derivative by the camera point (M, 4, 2, 3) and by the lens (M, 4, 2, 5)."""
+    z = np.where(np.abs(cam[..., 2]) < 1e-6, 1e-6, cam[..., 2])
+    xy = cam[..., :2] / z[..., None]
+    r2 = (xy * xy).sum(-1)
+    radial = 1 + r2 * (lens.k1 + r2 * lens.k2)
+    f = lens.focal_px
+    offset = f * xy * radial[..., None]
+    residual = offset + np.array([lens.cx, lens.cy]) - measured
+    d_xy = f * (
+        radial[..., None, None] * np.eye(2)
+        + 2 * (lens.k1 + 2 * lens.k2 * r2)[..., None, None] * xy[..., :, None] * xy[..., None, :]
+    )
+    d_cam = np.zeros((*xy.shape, 3))
+    d_cam[..., :2] = d_xy / z[..., None, None]
+    d_cam[..., 2] = -(d_xy @ xy[..., None])[..., 0] / z[..., None]
+    d_lens = np.zeros((*xy.shape, LENS))
+    d_lens[..., 0] = offset
+    d_lens[..., 0, 1] = d_lens[..., 1, 2] = 1
+    d_lens[..., 3] = f * xy * r2[..., None]
+    d_lens[..., 4] = f * xy * (r2**2)[..., None]
+    return residual, d_cam, d_lens
+
+
+def _turn(pose: Pose, step: Floats) -> Pose:
+    R = rotation_from_vector(step[:3]) @ pose.R
+    u, _, vt = np.linalg.svd(R)
+    return Pose(u @ vt, pose.t + step[3:])
+
+
+def _apply(scene: MarkerScene, step: Floats, edge_mm: float, refine_lens: bool) -> MarkerScene:
+    lens = scene.lens
+    if refine_lens:
+        lens = replace(
+            lens,
+            focal_px=lens.focal_px * float(np.exp(np.clip(step[0], -0.3, 0.3))),
+            cx=lens.cx + float(step[1]),
+            cy=lens.cy + float(step[2]),
+            k1=lens.k1 + float(step[3]),
+            k2=lens.k2 + float(step[4]),
+        )
+    P = len(scene.poses)
+    photo_steps = step[LENS : LENS + 6 * P].reshape(P, 6)
+    poses = tuple(_turn(p, s) for p, s in zip(scene.poses, photo_steps, strict=True))
+    rest = step[LENS + 6 * P :]
+    if scene.squares is None:
+        return MarkerScene(lens, poses, scene.corners + rest.reshape(-1, 4, 3), None)
+    squares = tuple(_turn(s, d) for s, d in zip(scene.squares, rest.reshape(-1, 6), strict=True))
+    return MarkerScene(lens, poses, corners_of(squares, edge_mm), squares)
+
+
+def corners_of(squares: tuple[Pose, ...], edge_mm: float) -> Floats:
+    """World corners (Q, 4, 3) mm of square markers with poses ``world_from_marker``."""
+    return np.stack([s.apply(square_corners(edge_mm)) for s in squares])
+
+
+def corner_covariance(scene: MarkerScene, info: SolveInfo, variance_factor: float) -> Floats:
+    """Marginal covariance (12 Q, 12 Q) mm^2 of all corners, in the frame that the corners themselves define.
+
+    The choice of frame is removed by projecting the rigid motions out of the corners (an S-transformation,
+    Baarda 1973), so that a variance is that of a corner's place within the layout.
+    """
+    Q = len(scene.corners)
+    start = LENS + 6 * len(scene.poses)
+    full = np.linalg.pinv(info.normal, rcond=1e-12, hermitian=True) * variance_factor
+    block = full[start:, start:]
+    if scene.squares is not None:
+        B = np.zeros((12 * Q, 6 * Q))
+        for q, square in enumerate(scene.squares):
+            arm = scene.corners[q] - square.t
+            for c in range(4):
+                row = 12 * q + 3 * c
+                B[row : row + 3, 6 * q : 6 * q + 6] = np.hstack([-skew(arm[c]), np.eye(3)])
+        block = B @ block @ B.T
+    points = scene.corners.reshape(-1, 3)
+    motions = np.concatenate(
+        [np.tile(np.eye(3), (len(points), 1, 1)), -skew(points - points.mean(0))], -1
+    ).reshape(-1, 6)
+    q_basis, _ = np.linalg.qr(motions)
+    keep = np.eye(12 * Q) - q_basis @ q_basis.T
+    return np.asarray(keep @ block @ keep)

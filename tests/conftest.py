@@ -1,0 +1,19 @@
+"""Fixtures that several test modules use."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+TEST_DATA_VARIABLE = "SPECIMAP_TEST_DATA"
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """The folder of phantoms with truth and of real data; tests that need it skip where it is not given."""
+    value = os.environ.get(TEST_DATA_VARIABLE)
+    if not value:
+        pytest.skip(f"{TEST_DATA_VARIABLE} is not set: the large test data are not on this machine")
+    return Path(value)
