@@ -1,0 +1,39 @@
+"""Native libraries that need a hand before they import."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+import sys
+from types import ModuleType
+
+from specimap.core.errors import BackendUnavailableError
+
+
+def open3d() -> ModuleType:
+    """Open3D, with the system library libusb brought by the package ``libusb-package`` where it is absent.
+
+    Raises:
+        BackendUnavailableError: it cannot be loaded; the advice names the one command that mends it.
+    """
+    if "open3d" in sys.modules:
+        return sys.modules["open3d"]
+    if sys.platform == "linux":
+        try:
+            ctypes.CDLL("libusb-1.0.so.0", mode=ctypes.RTLD_GLOBAL)
+        except OSError:
+            try:
+                package = importlib.import_module("libusb_package")
+                ctypes.CDLL(str(package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+            except (ImportError, OSError) as error:
+                raise BackendUnavailableError(
+                    f"Open3D needs the system library libusb-1.0, which is absent ({error}).",
+                    advice="Install it: sudo apt-get install libusb-1.0-0",
+                ) from error
+    try:
+        return importlib.import_module("open3d")
+    except (ImportError, OSError) as error:
+        raise BackendUnavailableError(
+            f"Open3D does not load: {error}.",
+            advice="Install the system libraries it wants: sudo apt-get install libusb-1.0-0 libgomp1 libgl1",
+        ) from error

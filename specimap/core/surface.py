@@ -1,0 +1,122 @@
+"""Depth maps to one mesh: truncated signed distances fused in a sparse voxel grid (Curless and Levoy 1996)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specimap.core.errors import DepthNotFoundError
+from specimap.core.geometry import Floats, Pose
+from specimap.core.native import open3d
+from specimap.core.reconstruct.depth import DepthMap
+
+
+@dataclass(frozen=True)
+class SurfaceSettings:
+    """Fusion.
+
+    ``voxel_mm``: edge of a voxel; by default a 1/200 of the marker layout's diagonal, at most 0.3 mm for the
+    usual layout. ``truncation_voxels``: reach of a depth on either side. ``least_weight``: depths that must
+    agree on a voxel.
+    """
+
+    voxel_mm: float = 0.3
+    truncation_voxels: float = 4.0
+    least_weight: float = 3.0
+    smallest_part_share: float = 0.02
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles in the marker frame: vertices (V, 3) mm float32, triangles (T, 3) int32, normals (V, 3) unit
+    outward, colours (V, 3) sRGB uint8."""
+
+    vertices: NDArray[np.float32]
+    triangles: NDArray[np.int32]
+    normals: NDArray[np.float32]
+    colours: NDArray[np.uint8]
+
+
+def fuse(
+    maps: list[DepthMap],
+    poses: tuple[Pose, ...],
+    settings: SurfaceSettings,
+    *,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Mesh:
+    """Fuse depth maps seen from ``poses`` (``cam_from_world`` of the photos they belong to).
+
+    Raises:
+        DepthNotFoundError: no voxel is seen often enough.
+    """
+    o3d = open3d()
+    core = o3d.core
+    grid = o3d.t.geometry.VoxelBlockGrid(
+        ("tsdf", "weight", "color"), (core.float32, core.float32, core.float32), ((1,), (1,), (3,)),
+        settings.voxel_mm, 16, 8000, core.Device("CPU:0"),
+    )  # fmt: skip
+    for done, depth_map in enumerate(maps, 1):
+        view = depth_map.view(poses[depth_map.photo])
+        depth = o3d.t.geometry.Image(np.ascontiguousarray(depth_map.depth))
+        colour = o3d.t.geometry.Image(depth_map.colour.astype(np.float32) / 255)
+        K = core.Tensor(view.intrinsics.matrix)
+        T = core.Tensor(view.cam_from_world.matrix)
+        far = float(depth_map.depth.max()) + 1.0
+        blocks = grid.compute_unique_block_coordinates(
+            depth, K, T, 1.0, far, settings.truncation_voxels
+        )
+        grid.integrate(blocks, depth, colour, K, K, T, 1.0, far, settings.truncation_voxels)
+        progress(done / len(maps))
+    mesh = grid.extract_triangle_mesh(settings.least_weight)
+    if "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
+        raise DepthNotFoundError(
+            "The photos gave no common surface.",
+            advice="Take sharper photos from 10-20 degrees apart, all around, with the specimen in the middle.",
+        )
+    vertices = mesh.vertex.positions.numpy()
+    triangles = mesh.triangle.indices.numpy().astype(np.int32)
+    colours = np.clip(mesh.vertex.colors.numpy() * 255, 0, 255).astype(np.uint8)
+    vertices, triangles, colours = _largest_parts(
+        vertices, triangles, colours, settings.smallest_part_share
+    )
+    return Mesh(vertices, triangles, vertex_normals(vertices, triangles), colours)
+
+
+def _largest_parts(
+    vertices: NDArray[np.float32],
+    triangles: NDArray[np.int32],
+    colours: NDArray[np.uint8],
+    smallest_share: float,
+) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.uint8]]:
+    """Drop connected parts with fewer triangles than a share of the largest: floating specks of false depth."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    n = len(vertices)
+    a, b = triangles[:, [0, 1]].ravel(), triangles[:, [1, 2]].ravel()
+    _, part = connected_components(coo_array((np.ones(len(a), bool), (a, b)), shape=(n, n)), directed=False)
+    of_triangle = part[triangles[:, 0]]
+    sizes = np.bincount(of_triangle, minlength=part.max() + 1)
+    kept = triangles[sizes[of_triangle] >= smallest_share * sizes.max()]
+    used = np.zeros(n, bool)
+    used[kept] = True
+    new_index = np.cumsum(used) - 1
+    return vertices[used], new_index[kept].astype(np.int32), colours[used]
+
+
+def vertex_normals(vertices: NDArray[np.float32], triangles: NDArray[np.int32]) -> NDArray[np.float32]:
+    """Area-weighted unit normals (V, 3)."""
+    corners: Floats = vertices.astype(float)[triangles]
+    face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.stack(
+        [
+            np.bincount(triangles.ravel(), np.repeat(face[:, k], 3), minlength=len(vertices))
+            for k in range(3)
+        ],
+        -1,
+    )
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return (normals / np.maximum(length, 1e-12)).astype(np.float32)
