@@ -18,7 +18,6 @@ from specimap.core.layout import edge_lengths, marker_frame, rigid_square
 from specimap.core.solver import (
     MarkerScene,
     Observations,
-    SolveInfo,
     corner_covariance,
     corners_of,
     rms_px,
@@ -145,7 +144,7 @@ def adjust(
         refined.get(k, _scaled(pose, factor) @ follow) for k, pose in enumerate(start_poses)
     )
     corners = final.apply(solved.corners)
-    covariance = corner_covariance(solved, info, _variance_factor(info, solved, inner))
+    covariance = corner_covariance(solved, info)
     return Adjusted(
         solved.lens, all_poses, ids, corners, _in_frame(covariance, final.R), scale, before, info.rms_after_px,
         info.iterations, len(inner.photo),
@@ -162,10 +161,3 @@ def _in_frame(covariance: Floats, R: Floats) -> Floats:
     blocks = covariance.reshape(n, 3, n, 3)
     return np.einsum("ij,ajbk,lk->aibl", R, blocks, R).reshape(3 * n, 3 * n)
 
-
-def _variance_factor(info: SolveInfo, scene: MarkerScene, seen: Observations) -> float:
-    """Sum of weighted squares over the redundancy: the a posteriori variance of unit weight."""
-    residual = scene.residuals(seen) / seen.sigma_px[:, None, None]
-    redundancy = residual.size - np.linalg.matrix_rank(info.normal)
-    total = float((info.weights[:, None, None] * residual**2).sum())
-    return total / max(redundancy, 1)

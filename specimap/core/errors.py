@@ -155,6 +155,15 @@ class RegistrationError(SpecimapError, ValueError):
     code = "registration_failed"
 
 
+# ---- cloud --------------------------------------------------------------------------------------------
+
+
+class CloudDamagedError(SpecimapError, ValueError):
+    """A stored cloud lacks an array, or its bytes do not decode; ``details['array']`` names it where known."""
+
+    code = "cloud_damaged"
+
+
 # ---- the program --------------------------------------------------------------------------------------
 
 
@@ -204,6 +213,7 @@ HTTP_STATUS: dict[type[SpecimapError], int] = {
     SpecimapError: 500,
     BackendUnavailableError: 503,
     CancelledError: 409,
+    CloudDamagedError: 500,
     CubeContentError: 422,
     CubeFormatError: 415,
     CubeHeaderError: 422,

@@ -8,7 +8,9 @@ markers' corners); Levenberg-Marquardt damping also takes care of the free choic
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +22,15 @@ Ints = NDArray[np.int64]
 LENS = 5  # log focal length, cx, cy, k1, k2
 PRIOR_FOCAL = 0.05
 """Standard deviation of the logarithm of a focal length that EXIF states."""
-PRIOR_CENTRE = 0.006
+PRIOR_CENTRE = 0.003
 """Standard deviation of the principal point about the image's centre, as a share of the width."""
 PRIOR_RADIAL = (0.1, 0.1)
 HUBER = 2.5
 """Residuals beyond this many standard deviations lose weight."""
+NOISE_ROUNDS = 3
+"""How often the scatter of the corners is estimated anew; large at first, so that a rough start is forgiven."""
+MEDIAN_OF_RAYLEIGH = 1.1774
+"""Median length of a 2D normal vector of unit standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +73,8 @@ class MarkerScene:
 @dataclass(frozen=True)
 class SolveInfo:
     """How a solution was reached: iterations, final robust cost, RMS in pixels before and after (unweighted
-    corner distance), weights (M,) that the robust loss left, and the normal matrix of all unknowns."""
+    corner distance), weights (M,) that the robust loss left, the normal matrix of all unknowns, and the factor by
+    which the corners scatter beyond their stated sigma, which the normal matrix already counts."""
 
     iterations: int
     cost: float
@@ -75,6 +82,7 @@ class SolveInfo:
     rms_after_px: float
     weights: Floats
     normal: Floats
+    excess: float
 
 
 def square_corners(edge_mm: float) -> Floats:
@@ -106,26 +114,51 @@ def solve(
     before = rms_px(scene.residuals(seen))
     prior_focal = focal_prior_px or scene.lens.focal_px
     focal_sd = PRIOR_FOCAL if focal_prior_px else 10.0
-    damping, cost = 1e-4, np.inf
-    H, g, cost, weights = _normal_equations(scene, seen, edge_mm, refine_lens, robust, prior_focal, focal_sd)
-    done = 0
-    for done in range(1, iterations + 1):
-        diagonal = np.diag(H).copy()
-        step = np.linalg.solve(H + np.diag(damping * diagonal + 1e-12), -g)
+    given, steps = seen, 0
+    for _ in range(NOISE_ROUNDS if robust else 1):
+        # What the corners scatter by beyond their own sigma (an uneven print, a lens that two terms do not
+        # describe) is noise all the same; unless it is counted, the priors have no say.
+        norm = np.sqrt((scene.residuals(given) ** 2).sum(-1)) / given.sigma_px[:, None]
+        excess = max(1.0, float(np.median(norm)) / MEDIAN_OF_RAYLEIGH)
+        seen = replace(given, sigma_px=given.sigma_px * excess)
+        system = partial(
+            _normal_equations, seen=seen, edge_mm=edge_mm, refine_lens=refine_lens, robust=robust,
+            prior_focal=prior_focal, focal_sd=focal_sd,
+        )  # fmt: skip
+        scene, taken, (H, _, cost, weights) = _descend(scene, system, edge_mm, refine_lens, iterations)
+        steps += taken
+    after = rms_px(scene.residuals(seen))
+    return scene, SolveInfo(steps, cost, before, after, weights, H, excess)
+
+
+System = tuple[Floats, Floats, float, Floats]
+
+
+def _descend(
+    scene: MarkerScene,
+    system: Callable[[MarkerScene], System],
+    edge_mm: float,
+    refine_lens: bool,
+    iterations: int,
+) -> tuple[MarkerScene, int, System]:
+    """Levenberg-Marquardt until a step gains less than a ten-millionth."""
+    damping, taken = 1e-4, 0
+    current = system(scene)
+    for taken in range(1, iterations + 1):  # noqa: B007
+        H, g, cost, _ = current
+        step = np.linalg.solve(H + np.diag(damping * np.diag(H) + 1e-12), -g)
         moved = _apply(scene, step, edge_mm, refine_lens)
-        trial = _normal_equations(moved, seen, edge_mm, refine_lens, robust, prior_focal, focal_sd)
+        trial = system(moved)
         if trial[2] < cost:
-            gain = cost - trial[2]
-            scene, (H, g, cost, weights) = moved, trial
+            scene, current = moved, trial
             damping = max(damping / 5, 1e-9)
-            if gain < 1e-7 * cost:
+            if cost - trial[2] < 1e-7 * cost:
                 break
         else:
             damping *= 8
             if damping > 1e8:
                 break
-    after = rms_px(scene.residuals(seen))
-    return scene, SolveInfo(done, cost, before, after, weights, H)
+    return scene, taken, current
 
 
 def _normal_equations(
@@ -136,7 +169,8 @@ def _normal_equations(
     robust: bool,
     prior_focal: float,
     focal_sd: float,
-) -> tuple[Floats, Floats, float, Floats]:
+) -> System:
+    """Normal matrix, gradient, robust cost, and mean weight (M,) of each observation."""
     lens, poses = scene.lens, scene.poses
     P, Q = len(poses), len(scene.corners)
     size = 12 if scene.squares is None else 6
@@ -169,15 +203,20 @@ def _normal_equations(
     Jm = (J_marker * root[..., None]).reshape(M, 8, size)
     offset_m = LENS + 6 * P
     n = offset_m + size * Q
-    H, g = np.zeros((n, n)), np.zeros(n)
     J = np.concatenate([Jl, Jp, Jm], -1)
     blocks = np.einsum("mri,mrj->mij", J, J)
     gradient = np.einsum("mri,mr->mi", J, r)
-    for k in range(M):
-        p, m = LENS + 6 * int(seen.photo[k]), offset_m + size * int(seen.marker[k])
-        columns = np.r_[0:LENS, p : p + 6, m : m + size]
-        H[np.ix_(columns, columns)] += blocks[k]
-        g[columns] += gradient[k]
+    columns = np.concatenate(
+        [
+            np.tile(np.arange(LENS), (M, 1)),
+            LENS + 6 * seen.photo[:, None] + np.arange(6),
+            offset_m + size * seen.marker[:, None] + np.arange(size),
+        ],
+        axis=1,
+    )
+    flat = columns[:, :, None] * n + columns[:, None, :]
+    H = np.bincount(flat.ravel(), blocks.ravel(), n * n).reshape(n, n)
+    g = np.bincount(columns.ravel(), gradient.ravel(), n)
     deviation = np.array(
         [
             np.log(lens.focal_px / prior_focal),
@@ -254,7 +293,7 @@ def corners_of(squares: tuple[Pose, ...], edge_mm: float) -> Floats:
     return np.stack([s.apply(square_corners(edge_mm)) for s in squares])
 
 
-def corner_covariance(scene: MarkerScene, info: SolveInfo, variance_factor: float) -> Floats:
+def corner_covariance(scene: MarkerScene, info: SolveInfo) -> Floats:
     """Marginal covariance (12 Q, 12 Q) mm^2 of all corners, in the frame that the corners themselves define.
 
     The choice of frame is removed by projecting the rigid motions out of the corners (an S-transformation,
@@ -262,7 +301,7 @@ def corner_covariance(scene: MarkerScene, info: SolveInfo, variance_factor: floa
     """
     Q = len(scene.corners)
     start = LENS + 6 * len(scene.poses)
-    full = np.linalg.pinv(info.normal, rcond=1e-12, hermitian=True) * variance_factor
+    full = np.linalg.pinv(info.normal, rcond=1e-12, hermitian=True)
     block = full[start:, start:]
     if scene.squares is not None:
         B = np.zeros((12 * Q, 6 * Q))

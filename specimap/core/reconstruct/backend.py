@@ -1,0 +1,169 @@
+"""Stage 1 behind one Protocol: photos and corners in, cameras and depth out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specimap.core.acquisition import Photo, Refusal
+from specimap.core.errors import DuplicateMarkersError, NoMarkersFoundError, WrongDictionaryError
+from specimap.core.fiducials import Detection, detect_markers, fitting_dictionaries
+from specimap.core.geometry import Floats, Intrinsics, Pose
+from specimap.core.reconstruct.depth import DepthMap, DepthSettings
+from specimap.core.solver import Observations
+
+CORNER_FLOOR_PX = 0.05
+"""Least standard deviation of a corner: what neighbouring profiles share does not show in their scatter."""
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class ReconstructSettings:
+    """Stage 1. ``dictionary``: the markers' family. ``edge_mm``: their edge. ``backend``: which backend."""
+
+    dictionary: str = "DICT_4X4_50"
+    edge_mm: float = 6.8
+    backend: str = "colmap"
+    depth: DepthSettings = DepthSettings()
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class CornersInPhotos:
+    """All markers in all photos: ``seen.photo`` indexes the photos, ``seen.marker`` indexes ``marker_ids``
+    (ascending)."""
+
+    seen: Observations
+    marker_ids: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Stage 1's answer, in a frame and scale of the backend's choice.
+
+    ``photos``: indices of the posed photos; ``poses``: their ``cam_from_world``; ``maps``: depth maps, whose
+    ``photo`` counts in ``photos``; ``points`` (N, 3): sparse points; ``refused``: photos left out and why;
+    ``remarks``: (code, sentence) that the report should carry.
+    """
+
+    photos: tuple[int, ...]
+    lens: Intrinsics
+    poses: tuple[Pose, ...]
+    maps: tuple[DepthMap, ...]
+    points: NDArray[np.float32]
+    refused: tuple[Refusal, ...]
+    remarks: tuple[tuple[str, str], ...]
+
+
+class ReconstructionBackend(Protocol):
+    """What turns photos into cameras and depth."""
+
+    name: str
+
+    def reconstruct(
+        self,
+        photos: list[Photo],
+        corners: CornersInPhotos,
+        settings: ReconstructSettings,
+        *,
+        workers: int,
+        progress: Progress,
+    ) -> Reconstruction:
+        """Pose the photos and measure depth; raises leaves of SpecimapError."""
+        ...
+
+
+def corners_in_photos(
+    photos: list[Photo], detections: list[list[Detection]], dictionary: str
+) -> CornersInPhotos:
+    """Gather detections (one list a photo) and judge them as a whole.
+
+    An id that shows twice in a photo is left out there; where that is the rule, it is an error. An id that one
+    photo alone shows, while others are shared, is taken for a false reading.
+
+    Raises:
+        NoMarkersFoundError: no photo shows a marker, of this dictionary or any known one.
+        WrongDictionaryError: another dictionary fits; the advice names it.
+        DuplicateMarkersError: several markers carry one id.
+    """
+    twice: dict[int, int] = {}
+    shown: dict[int, int] = {}
+    rows: list[tuple[int, Detection]] = []
+    for photo, found in enumerate(detections):
+        ids = [d.marker_id for d in found]
+        for marker_id in set(ids):
+            shown[marker_id] = shown.get(marker_id, 0) + 1
+            twice[marker_id] = twice.get(marker_id, 0) + (ids.count(marker_id) > 1)
+        rows += [(photo, d) for d in found if ids.count(d.marker_id) == 1]
+    duplicates = sorted(i for i, n in twice.items() if n >= 2 and n >= 0.3 * shown[i])
+    if duplicates:
+        raise DuplicateMarkersError(
+            f"Marker id {', '.join(map(str, duplicates))} stands on more than one marker.",
+            advice="Give every marker around the specimen an id of its own.",
+            ids=duplicates,
+        )
+    shared = {i for i, n in shown.items() if n - twice[i] >= 2}
+    rows = [(photo, d) for photo, d in rows if d.marker_id in shared]
+    if not rows:
+        _refuse_without_markers(photos, dictionary)
+    ids_used = tuple(sorted({d.marker_id for _, d in rows}))
+    index = {marker_id: k for k, marker_id in enumerate(ids_used)}
+    seen = Observations(
+        np.array([photo for photo, _ in rows]),
+        np.array([index[d.marker_id] for _, d in rows]),
+        np.stack([d.corners_px for _, d in rows]),
+        np.hypot(np.array([d.sigma_px for _, d in rows]), CORNER_FLOOR_PX),
+    )
+    return CornersInPhotos(seen, ids_used)
+
+
+def _refuse_without_markers(photos: list[Photo], dictionary: str) -> None:
+    few = [p.grey for p in photos[:: max(1, len(photos) // 3)]][:3]
+    fitting = fitting_dictionaries(few)
+    fitting.pop(dictionary, None)
+    if fitting:
+        best = next(iter(fitting))
+        raise WrongDictionaryError(
+            f"No marker of {dictionary} shows in the photos, but markers of {best} do.",
+            advice=f"Run again with the dictionary {best}.",
+            dictionary=dictionary,
+            fitting=fitting,
+        )
+    raise NoMarkersFoundError(
+        f"No marker of {dictionary} shows in two of the photos.",
+        advice="Place the four printed markers around the specimen, flat and wholly in view, and photograph again.",
+        dictionary=dictionary,
+    )
+
+
+def detect_in_photos(
+    photos: list[Photo], dictionary: str, *, workers: int, progress: Progress
+) -> list[list[Detection]]:
+    """Markers of every photo, in order; several photos at a time."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    expected = 4
+    found: list[list[Detection]] = []
+    with ThreadPoolExecutor(workers) as pool:
+        for one in pool.map(lambda p: detect_markers(p.grey, dictionary, expected=expected), photos):
+            found.append(one)
+            progress(len(found) / len(photos))
+    return found
+
+
+def sparse_points(maps: list[DepthMap], poses: tuple[Pose, ...], per_map: int = 200) -> NDArray[np.float32]:
+    """A thin, even sample of the depth maps' points (N, 3), for the report and for checks."""
+    parts: list[Floats] = []
+    for depth_map in maps:
+        rows, cols = np.nonzero(depth_map.depth)
+        step = max(1, len(rows) // per_map)
+        r, c = rows[::step], cols[::step]
+        view = depth_map.view(poses[depth_map.photo])
+        cam = view.intrinsics.rays(np.stack([c, r], -1).astype(float)) * depth_map.depth[r, c][:, None]
+        parts.append(view.cam_from_world.inverse().apply(cam))
+    return np.concatenate(parts or [np.zeros((0, 3))]).astype(np.float32)
