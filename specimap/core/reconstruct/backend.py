@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -29,7 +29,7 @@ class ReconstructSettings:
     dictionary: str = "DICT_4X4_50"
     edge_mm: float = 6.8
     backend: str = "colmap"
-    depth: DepthSettings = DepthSettings()
+    depth: DepthSettings = field(default_factory=DepthSettings)
     seed: int = 0
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -205,8 +205,27 @@ def match_pair(
     total = disparity + d_low
     depth = np.where(valid & (total > 0.5), virtual.focal_px * rectified.baseline_mm / total, 0)
     depth = _inside(depth.astype(np.float32), virtual, rectified.turns[0] @ poses[0].R, poses[0], volume)
-    weight = (depth > 0).astype(np.float32)
-    return DepthMap(photo, rectified.turns[0], virtual, depth, weight, left)
+    return _cropped(photo, rectified.turns[0], virtual, depth, left)
+
+
+def _cropped(
+    photo: int, turn: Floats, virtual: Intrinsics, depth: Singles, colour: Bytes
+) -> DepthMap | None:
+    """The part of the window that holds depth; None where too little does."""
+    rows, cols = np.flatnonzero(depth.any(1)), np.flatnonzero(depth.any(0))
+    if len(rows) < 8 or len(cols) < 8:
+        return None
+    top, left, bottom, right = rows[0], cols[0], rows[-1] + 1, cols[-1] + 1
+    part = np.ascontiguousarray(depth[top:bottom, left:right])
+    lens = replace(
+        virtual,
+        width=int(right - left),
+        height=int(bottom - top),
+        cx=virtual.cx - float(left),
+        cy=virtual.cy - float(top),
+    )
+    weight = (part > 0).astype(np.float32)
+    return DepthMap(photo, turn, lens, part, weight, np.ascontiguousarray(colour[top:bottom, left:right]))
 
 
 def _refine(left: Bytes, right: Bytes, disparity: Singles, valid: NDArray[np.bool_]) -> Singles:

@@ -1,0 +1,114 @@
+"""Raw counts to reflectance with a white and a dark reference of the same instrument.
+
+reflectance = (raw - dark) / (white - dark), for each column and band: each has its own response. The
+references are averaged over their rows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specimap.core.cube.model import Cube
+from specimap.core.cube.pixels import Pixels
+from specimap.core.cube.strided import to_bip
+from specimap.core.cube.wavelengths import Warnings
+from specimap.core.errors import CubeContentError
+from specimap.core.geometry import Array, Floats
+
+# Wider apart than a band of any imager: the reference was taken with other settings.
+_WAVELENGTH_TOLERANCE_NM = 1.0
+
+
+def calibrated(raw: Cube, white: Cube, dark: Cube | None) -> Cube:
+    """The cube of reflectance (float32) of a raw cube. Without a dark reference, 0 counts are taken as dark.
+
+    Where the white is not brighter than the dark, reflectance is NaN. Raises CubeContentError for a reference
+    whose columns or bands do not fit.
+    """
+    warnings: Warnings = _fit(raw, white, "white") + (_fit(raw, dark, "dark") if dark else ())
+    white_line = _mean_line(white)
+    dark_line = np.zeros_like(white_line) if dark is None else _mean_line(dark)
+    if dark is None:
+        warnings += (("dark_missing", "No dark reference was given; a dark signal of zero is assumed."),)
+    span = np.broadcast_to(white_line - dark_line, (raw.cols, raw.bands))
+    usable = span > 0  # False for NaN, too
+    if not usable.any():
+        raise CubeContentError(
+            "The white reference is nowhere brighter than the dark one.",
+            advice="Check that the two references are not exchanged.",
+        )
+    if not usable.all():
+        count = int(usable.size - usable.sum())
+        text = f"At {count} of {usable.size} columns x bands the white is not brighter than the dark."
+        warnings += (("reference_invalid", f"{text} Reflectance is unknown (NaN) there."),)
+    gain = np.full(span.shape, np.nan)
+    np.divide(1.0, span, out=gain, where=usable)
+    pixels = _CalibratedPixels(
+        raw.pixels,
+        np.broadcast_to(dark_line, span.shape).astype(np.float32),
+        gain.astype(np.float32),
+    )
+    return replace(
+        raw,
+        pixels=pixels,
+        files=raw.files + white.files + (dark.files if dark else ()),
+        quantity="reflectance",
+        to_reflectance=1.0,
+        warnings=raw.warnings + warnings,
+    )
+
+
+def _fit(raw: Cube, reference: Cube, name: str) -> Warnings:
+    if reference.bands != raw.bands or reference.cols not in (1, raw.cols):
+        raise CubeContentError(
+            f"The {name} reference has {reference.cols} columns and {reference.bands} bands, "
+            f"the cube {raw.cols} and {raw.bands}.",
+            advice=f"Give the {name} reference that was recorded with the cube, with the same binning.",
+            reference=name,
+            expected=[raw.cols, raw.bands],
+            found=[reference.cols, reference.bands],
+        )
+    apart = np.abs(reference.wavelengths_nm - raw.wavelengths_nm)
+    if (apart > _WAVELENGTH_TOLERANCE_NM).any():  # NaN, where either names none, does not count
+        text = f"The {name} reference's wavelengths are up to {np.nanmax(apart):.1f} nm off the cube's."
+        return ((f"{name}_wavelengths_differ", text),)
+    return ()
+
+
+def _mean_line(reference: Cube) -> Floats:
+    """Mean over the rows, (cols, bands), NaN left out; NaN where there is nothing else."""
+    total = np.zeros((reference.cols, reference.bands))
+    count = np.zeros((reference.cols, reference.bands), np.int64)
+    step = reference.pixels.strip_rows()
+    for start in range(0, reference.rows, step):
+        strip = reference.read_rows(start, min(start + step, reference.rows))
+        known = ~np.isnan(strip)
+        total += np.where(known, strip, 0).sum(0, dtype=np.float64)
+        count += known.sum(0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+class _CalibratedPixels(Pixels):
+    def __init__(self, raw: Pixels, dark: NDArray[np.float32], gain: NDArray[np.float32]) -> None:
+        self.shape = raw.shape
+        self.dtype = np.dtype(np.float32)
+        self._raw, self._dark, self._gain = raw, dark, gain
+
+    def block(self, start: int, stop: int) -> Array:
+        raw = to_bip(self._raw.block(start, stop))
+        out = np.subtract(raw, self._dark, dtype=np.float32, casting="same_kind")
+        out *= self._gain
+        return out
+
+    def band(self, index: int) -> Array:
+        values = self._raw.band(index).astype(np.float32)
+        values -= self._dark[:, index]
+        values *= self._gain[:, index]
+        return values
+
+    def strip_rows(self) -> int:
+        # A quarter: raw values, differences and products of a strip are alive at once.
+        return max(1, super().strip_rows() // 4)

@@ -1,0 +1,84 @@
+"""Is there anything usable in a cube? Cheap: a few sampled rows and the mean image, no second pass."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specimap.core.cube.model import Cube, sampled_rows
+from specimap.core.cube.wavelengths import Warnings
+from specimap.core.errors import CubeContentError
+from specimap.core.geometry import Array
+
+_SAMPLED_ROWS = 24
+_SAMPLED_PIXELS = 24 * 512
+# Values within this share below the largest one: a scene thins out there, a clipped sensor does not.
+_TOP_SHARE = 0.01
+# As many values on the largest one are no chance, but a plateau.
+_LEAST_PLATEAU = 8
+# Fewer pixels at the largest value than this are glints or dead pixels, no saturation worth a word.
+_LEAST_SATURATED_SHARE = 0.001
+
+
+def inspect(cube: Cube, mean: NDArray[np.float32]) -> Warnings:
+    """Warnings (code, sentence) about a cube's values; ``mean`` (rows, cols) is its mean image.
+
+    Codes: ``single_band``, ``bands_all_zero``, ``pixels_nan``, ``values_nan``, ``saturated``. Raises
+    CubeContentError for a cube without finite values, or whose values are all the same.
+    """
+    if not np.isfinite(mean).any():
+        raise CubeContentError(
+            f"{cube.path.name} holds no finite value.", advice="Export the cube again; check its data type."
+        )
+    sample = _sample(cube)
+    finite = sample[np.isfinite(sample)]
+    if np.ptp(mean[np.isfinite(mean)]) == 0 and (not finite.size or np.ptp(finite) == 0):
+        raise CubeContentError(
+            f"All values of {cube.path.name} are the same.",
+            advice="Check that the shutter was open and that the right file was given.",
+        )
+    warnings: list[tuple[str, str]] = []
+    if cube.bands == 1:
+        warnings.append(("single_band", "The cube has one band only: it carries no spectra."))
+    zero = ~sample.any((0, 1)) & ~cube.bad_bands
+    if zero.any():
+        listed = ", ".join(str(i) for i in np.flatnonzero(zero)[:8]) + (", ..." if zero.sum() > 8 else "")
+        warnings.append(("bands_all_zero", f"{int(zero.sum())} bands hold zeros only: {listed}."))
+    lost = int(np.isnan(mean).sum())
+    if lost:
+        warnings.append(("pixels_nan", f"{lost} of {mean.size} pixels hold no value in any good band."))
+    holes = float(np.isnan(sample[..., ~cube.bad_bands]).mean()) if sample.dtype.kind == "f" else 0.0
+    if holes > lost / mean.size:
+        warnings.append(("values_nan", f"About {holes:.2%} of the values are missing (NaN)."))
+    share = saturated_share(sample[..., ~cube.bad_bands])
+    if share > _LEAST_SATURATED_SHARE:
+        warnings.append(("saturated", f"About {share:.1%} of the pixels are saturated in at least one band."))
+    return tuple(warnings)
+
+
+def _sample(cube: Cube) -> Array:
+    """Pixels of evenly spread rows and columns, (n, k, bands)."""
+    rows = sampled_rows(cube.rows, _SAMPLED_ROWS)
+    step = max(1, len(rows) * cube.cols // _SAMPLED_PIXELS)
+    return np.concatenate([cube.read_rows(r, r + 1)[:, ::step] for r in rows])
+
+
+def saturated_share(spectra: Array) -> float:
+    """Share of the spectra (..., bands) with a value at which the sensor clips; 0 where none is found.
+
+    The largest value counts as a clip if it is the integer type's own, or if more values lie on it than in
+    the whole hundredth below it: a plateau.
+    """
+    finite = spectra[np.isfinite(spectra)]
+    if not finite.size:
+        return 0.0
+    top = finite.max()
+    at_top = int((finite == top).sum())
+    clips = spectra.dtype.kind in "iu" and top == np.iinfo(spectra.dtype).max
+    if not clips:
+        depth = float(top) * _TOP_SHARE
+        if spectra.dtype.kind in "iu":
+            depth = max(depth, 1.0)  # of few grey levels the next one must count
+        below = int((finite >= float(top) - depth).sum()) - at_top
+        clips = top > 0 and at_top >= _LEAST_PLATEAU and at_top > below
+    return float((spectra == top).any(-1).mean()) if clips else 0.0

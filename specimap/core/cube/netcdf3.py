@@ -1,0 +1,63 @@
+"""NetCDF3: scipy reads the header, the values are mapped."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.io import netcdf_file
+
+from specimap.core.cube.discover import Variable, choose_cube, choose_wavelengths, cube_axes
+from specimap.core.cube.model import Cube, describe
+from specimap.core.cube.npy import starts_with
+from specimap.core.cube.pixels import ArrayPixels
+from specimap.core.geometry import Array, Floats
+
+_NETCDF3_MAGIC = (b"CDF\x01", b"CDF\x02")
+
+
+class NetCdf3Format:
+    """The variable with three axes, mapped; the axis called wavelength or band is the bands'."""
+
+    name = "NetCDF3"
+    suffixes: tuple[str, ...] = (".nc", ".cdf")
+
+    def matches(self, path: Path) -> bool:
+        return any(starts_with(path, magic) for magic in _NETCDF3_MAGIC)
+
+    def open(self, path: Path) -> Cube:
+        with netcdf_file(path, "r", mmap=True) as file:
+            variables = [
+                Variable(name, tuple(v.shape), v.data.dtype, tuple(v.dimensions), _units(v))
+                for name, v in file.variables.items()
+            ]
+            cube = choose_cube(path, variables)
+            wavelengths = choose_wavelengths(variables, cube)
+            values: Floats | None = None
+            if wavelengths is not None:
+                values = np.array(file.variables[wavelengths.name].data, np.float64).ravel()
+            array = _mapped_again(path, file.variables[cube.name].data)
+        axes, warnings = cube_axes(cube, wavelengths, reversed_axes=False)
+        return describe(
+            path,
+            self.name,
+            ArrayPixels(array.transpose(axes)),
+            wavelengths=values,
+            units=wavelengths.units if wavelengths else None,
+            warnings=warnings,
+        )
+
+
+def _units(variable: object) -> str | None:
+    units = getattr(variable, "units", None)
+    return units.decode("utf-8", "replace") if isinstance(units, bytes) else None
+
+
+def _mapped_again(path: Path, data: Array) -> Array:
+    """The same bytes of the file through a map of our own: scipy's must be gone when its file closes."""
+    base = data
+    while isinstance(base.base, np.ndarray):
+        base = base.base
+    offset = data.__array_interface__["data"][0] - base.__array_interface__["data"][0]
+    whole = np.asarray(np.memmap(path, np.uint8, "r"))
+    return np.ndarray(data.shape, data.dtype, buffer=whole, offset=offset, strides=data.strides)

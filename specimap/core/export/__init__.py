@@ -1,0 +1,52 @@
+"""A spectral cloud as a file of another program: PLY, LAS, NPZ, ENVI, CSV.
+
+Every export is streamed in bounded memory and appears whole or not at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+from specimap.core.cloud import Cloud
+from specimap.core.errors import SettingsError
+from specimap.core.export.envi import write_envi
+from specimap.core.export.las import write_las
+from specimap.core.export.npz import write_npz
+from specimap.core.export.ply import write_ply
+from specimap.core.export.table import write_csv
+
+ExportFormat = Literal["ply", "las", "npz", "envi", "csv"]
+
+_Exporter = Callable[[Cloud, Path, float], Path]
+
+EXPORTERS: dict[str, _Exporter] = {
+    "ply": lambda cloud, target, _: write_ply(cloud, target),
+    "las": lambda cloud, target, _: write_las(cloud, target),
+    "npz": lambda cloud, target, _: write_npz(cloud, target),
+    "envi": lambda cloud, target, grid_mm: write_envi(cloud, target, grid_mm=grid_mm),
+    "csv": lambda cloud, target, _: write_csv(cloud, target),
+}
+"""Another format is one function here."""
+
+
+def export_cloud(cloud: Cloud, target: Path, format: ExportFormat, *, grid_mm: float = 0.5) -> Path:
+    """Write the cloud to ``target``, replacing it; the path written (ENVI: the header's).
+
+    Spectra are in ``npz``, ``csv`` and, resampled on a top view of ``grid_mm``, ``envi``; ``ply`` and ``las``
+    hold the geometry, in the cloud's order, so that the n-th point's spectrum is the cloud's n-th.
+
+    Raises SettingsError for an unknown format or a grid that is not positive or far too fine,
+    BackendUnavailableError where a format's library is not installed, StorageFullError,
+    OutputNotWritableError, CloudDamagedError.
+    """
+    exporter = EXPORTERS.get(format)
+    if exporter is None:
+        raise SettingsError(
+            f"There is no export format {format!r}.",
+            advice=f"Choose one of {', '.join(EXPORTERS)}.",
+            setting="format",
+            choices=list(EXPORTERS),
+        )
+    return exporter(cloud, target, grid_mm)

@@ -1,0 +1,6 @@
+"""The four stages in order, each resumable from its artefact."""
+
+from specimap.core.pipeline.run import Inputs, Outputs, run_pipeline
+from specimap.core.pipeline.settings import PipelineSettings
+
+__all__ = ["Inputs", "Outputs", "PipelineSettings", "run_pipeline"]

@@ -1,0 +1,271 @@
+"""Stages 3 and 4, and what is written: mesh, corners, cloud, preview, report."""
+
+from __future__ import annotations
+
+import datetime
+import json
+from dataclasses import asdict, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specimap import __version__
+from specimap.core.accuracy import CornersInCube, camera_figures, homography_figures, spread
+from specimap.core.acquisition import RECOMMENDED_PHOTOS
+from specimap.core.adjust import Adjusted, triangulate
+from specimap.core.cloud import Cloud, CloudPoints, Flag
+from specimap.core.cloud.writer import write_cloud
+from specimap.core.cube import Cube
+from specimap.core.files import write_text
+from specimap.core.geometry import Floats, Pose, View
+from specimap.core.layout import edge_lengths
+from specimap.core.meshfile import write_mesh_ply
+from specimap.core.pipeline.artefacts import Stage1, Stage2
+from specimap.core.pipeline.run import Clock, Outputs, all_refused
+from specimap.core.pipeline.settings import PipelineSettings
+from specimap.core.points import cloud_points
+from specimap.core.preview import write_preview
+from specimap.core.raycast import RayCaster
+from specimap.core.register.camera import CubeCamera, solve_camera
+from specimap.core.register.cube_markers import CubeMarkers, find_markers
+from specimap.core.register.register import (
+    Placement,
+    fit_homography,
+    place_by_camera,
+    place_by_homography,
+)
+from specimap.core.render import extent_of, render_grid
+from specimap.core.report import (
+    Coverage,
+    CubeCameraFigures,
+    EdgeLength,
+    Inliers,
+    Parallax,
+    Photos,
+    Refused,
+    Remark,
+    Report,
+    Reprojection,
+    SigmaFigures,
+)
+
+GRID_MARGIN_MM = 4.0
+CUBE_CORNER_FLOOR_PX = 0.03
+SUBJECT_DISAGREES = 2.0
+PLAUSIBLE_DISTANCE_MM = (40.0, 4000.0)
+
+
+def register_and_write(
+    stage1: Stage1,
+    stage2: Stage2,
+    cube: Cube,
+    settings: PipelineSettings,
+    outputs: Outputs,
+    clock: Clock,
+    remarks: list[tuple[str, str]],
+    inputs: dict[str, str],
+) -> Report:
+    """Render the grids, register the cube, write all results; the report comes last."""
+    adjusted, mesh = stage2.adjusted, stage2.mesh
+    with clock.stage("render") as progress:
+        caster = RayCaster(mesh)
+        low, high = extent_of(adjusted.corners, GRID_MARGIN_MM)
+        coarse = render_grid(caster, low, high, settings.render.r_reg_mm)
+        progress(0.3)
+        fine = render_grid(caster, low, high, settings.render.r_pc_mm)
+    with clock.stage("register") as progress:
+        found = find_markers(cube, settings.reconstruct.dictionary, adjusted.marker_ids)
+        progress(0.1)
+        seen = _corners_in_cube(found, adjusted, cube.cols)
+        flat = seen.flat()
+        camera = solve_camera(*flat, cube.rows, cube.cols)
+        homography = fit_homography(flat[0], flat[1], coarse, settings.register.ransac_px)
+        placements = {
+            "camera": place_by_camera(camera.view, caster, found.mirrored),
+            "homography": place_by_homography(homography, coarse, fine, camera.view, caster, found.mirrored),
+        }
+        progress(0.3)
+        chosen = placements[settings.register.method]
+        points = cloud_points(
+            chosen,
+            caster,
+            stage2.sigma_mm.astype(np.float32),
+            adjusted.corners,
+            float(np.median(adjusted.sigma_corner_mm)),
+            _registration_mm(camera),
+        )
+        progress(0.35)
+        figures = {
+            "camera": camera_figures(seen, camera.view, caster),
+            "homography": homography_figures(seen, coarse, fine, settings.register.ransac_px),
+        }
+        own = figures[settings.register.method]
+        report = Report(
+            specimap_version=__version__,
+            created=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            method=settings.register.method,
+            backend=settings.reconstruct.backend,
+            adjustment=settings.adjust.form,
+            marker_ids=list(adjusted.marker_ids),
+            marker_ids_in_cube=list(found.marker_ids),
+            corner_2d_mm=own.corner_2d_mm,
+            corner_3d_mm=own.corner_3d_mm,
+            leave_one_marker_out_mm=own.leave_one_marker_out_mm,
+            methods=figures,
+            edge_length_mm=_edges(stage1, adjusted, settings.adjust.edge_mm),
+            corner_sigma_mm=float(np.median(adjusted.sigma_corner_mm)),
+            reprojection_px=Reprojection(before=adjusted.rms_before_px, after=adjusted.rms_after_px),
+            photos=Photos(
+                given=len(stage1.names) + len(stage1.refused),
+                used=[stage1.names[p] for p in stage1.reconstruction.photos],
+                refused=[Refused(**asdict(r)) for r in all_refused(stage1)],
+            ),
+            inliers=Inliers(
+                n=int(homography.inliers.sum()),
+                of=len(homography.inliers),
+                threshold_px=settings.register.ransac_px,
+                threshold_mm=settings.register.ransac_px * settings.render.r_reg_mm,
+            ),
+            coverage=Coverage(
+                between_markers=_coverage(camera.view, found.mirrored, adjusted.corners, chosen, cube),
+                points=len(points),
+                specimen_points=int(((points.flags & Flag.SPECIMEN) > 0).sum()),
+            ),
+            parallax_removed_mm=_parallax(placements, points, settings.register.method),
+            sigma_mm=_sigma(points),
+            cube_camera=_camera(camera, found, cube),
+            photo_focal_px=adjusted.lens.focal_px,
+            seconds=dict(clock.seconds),
+            reused_stages=list(clock.reused),
+            warnings=[Remark(code=c, message=m) for c, m in [*remarks, *_remarks(stage1, adjusted, found)]],
+            settings=settings.as_dict(),
+            inputs=inputs,
+        )
+        outputs.report.unlink(missing_ok=True)  # an old report must not stand beside new results
+        write_mesh_ply(outputs.mesh, mesh)
+        named = zip(adjusted.marker_ids, adjusted.corners, strict=True)
+        write_text(outputs.corners, json.dumps({str(i): np.round(c, 6).tolist() for i, c in named}, indent=1))
+        write_cloud(
+            outputs.cloud,
+            points,
+            cube,
+            {"report": report.model_dump(mode="json"), "settings": settings.as_dict(), "inputs": inputs},
+            progress=lambda share: progress(0.4 + 0.5 * share),
+        )
+        write_preview(Cloud.open(outputs.cloud), outputs.preview)
+    report = report.model_copy(update={"seconds": dict(clock.seconds)})
+    write_text(outputs.report, report.model_dump_json(indent=1))
+    return report
+
+
+def _corners_in_cube(found: CubeMarkers, adjusted: Adjusted, cols: int) -> CornersInCube:
+    rows = [adjusted.marker_ids.index(i) for i in found.marker_ids]
+    pixels = found.corners_px.copy()
+    if found.mirrored:
+        pixels[..., 0] = cols - 1 - pixels[..., 0]
+    return CornersInCube(
+        found.marker_ids, adjusted.corners[rows], pixels, np.hypot(found.sigma_px, CUBE_CORNER_FLOOR_PX)
+    )
+
+
+def _registration_mm(camera: CubeCamera) -> float:
+    """Sideways standard deviation of a registered pixel: the corners' misfit, shared by all of them."""
+    view = camera.view
+    return camera.rms_px * float(view.cam_from_world.centre[2]) / view.intrinsics.focal_px
+
+
+def _edges(stage1: Stage1, adjusted: Adjusted, expected: float) -> EdgeLength:
+    """Edges of corners triangulated one by one: rigid squares would only repeat the known edge."""
+    seen = stage1.corners.seen
+    place = {photo: k for k, photo in enumerate(stage1.reconstruction.photos)}
+    keep = np.isin(seen.photo, stage1.reconstruction.photos)
+    kept = seen.of(keep)
+    inner = replace(kept, photo=np.array([place[int(p)] for p in kept.photo]))
+    corners = triangulate(adjusted.lens, adjusted.poses, inner, len(stage1.corners.marker_ids))
+    lengths = edge_lengths(corners[np.isfinite(corners).all(axis=(1, 2))])
+    figures = spread(lengths)
+    return EdgeLength(expected=expected, mean=figures.mean, std=figures.std, n=figures.n)
+
+
+def _coverage(view: View, mirrored: bool, corners: Floats, chosen: Placement, cube: Cube) -> float:
+    """Share of the cube's pixels within the hull of the markers' corners that have a point."""
+    import cv2
+
+    pixels = view.project(corners.reshape(-1, 3))
+    if mirrored:
+        pixels[:, 0] = cube.cols - 1 - pixels[:, 0]
+    hull = cv2.convexHull(pixels.astype(np.float32)).astype(np.int32)
+    inside = np.zeros((cube.rows, cube.cols), np.uint8)
+    cv2.fillConvexPoly(inside, hull, 1)
+    placed = np.zeros_like(inside)
+    placed[chosen.pixels[:, 0], chosen.pixels[:, 1]] = 1
+    return float((inside & placed).sum() / max(int(inside.sum()), 1))
+
+
+def _parallax(placements: dict[str, Placement], points: CloudPoints, method: str) -> Parallax:
+    """How far apart the two methods put the specimen's pixels."""
+    shape = tuple(int(p.pixels.max()) + 1 if len(p.pixels) else 1 for p in placements.values())
+    side = max(shape)
+    index: NDArray[np.int32] = np.full((side, side), -1, np.int32)
+    other = placements["homography" if method == "camera" else "camera"]
+    index[other.pixels[:, 0], other.pixels[:, 1]] = np.arange(len(other.pixels))
+    on_it = (points.flags & Flag.SPECIMEN) > 0
+    partner = index[points.hsi_pixel[on_it, 0], points.hsi_pixel[on_it, 1]]
+    both = partner >= 0
+    if not both.any():
+        return Parallax(median=0.0, maximum=0.0)
+    apart = np.linalg.norm(points.xyz[on_it][both] - other.xyz[partner[both]], axis=1)
+    return Parallax(median=float(np.median(apart)), maximum=float(apart.max()))
+
+
+def _sigma(points: CloudPoints) -> SigmaFigures:
+    on_it = (points.flags & Flag.SPECIMEN) > 0
+    sigma = points.sigma_mm[on_it] if on_it.any() else points.sigma_mm
+    return SigmaFigures(median=float(np.median(sigma)), p95=float(np.percentile(sigma, 95)))
+
+
+def _camera(camera: CubeCamera, found: CubeMarkers, cube: Cube) -> CubeCameraFigures:
+    pose: Pose = camera.view.cam_from_world
+    x_axis = pose.R[:, 0]
+    return CubeCameraFigures(
+        focal_px=camera.view.intrinsics.focal_px,
+        focal_relative_sd=camera.focal_sd,
+        distance_mm=float(pose.centre[2]),
+        reprojection_rms_px=camera.rms_px,
+        roll_deg=float(np.degrees(np.arctan2(-x_axis[1], x_axis[0]))),
+        mirrored=found.mirrored,
+        markers_found_in=found.where,
+    )
+
+
+def _remarks(stage1: Stage1, adjusted: Adjusted, found: CubeMarkers) -> list[tuple[str, str]]:
+    remarks: list[tuple[str, str]] = list(stage1.reconstruction.remarks)
+    used = len(stage1.reconstruction.photos)
+    if used < RECOMMENDED_PHOTOS:
+        remarks.append(("few_photos", f"{used} photos were used; {RECOMMENDED_PHOTOS} or more are recommended."))
+    missing = sorted(set(adjusted.marker_ids) - set(found.marker_ids))
+    if missing and len(adjusted.marker_ids) <= 8:
+        text = f"Marker {', '.join(map(str, missing))} does not show in the cube: {4 * len(found.marker_ids)} "
+        remarks.append(("markers_missing_in_cube", text + "correspondences are left."))
+    if found.where != "band mean":
+        remarks.append(("markers_not_in_band_mean", f"The markers show best in the {found.where}."))
+    if found.mirrored:
+        remarks.append(
+            ("cube_mirrored", "The cube is mirrored, as its markers show; columns were counted from the other side.")
+        )
+    distance = float(np.median([p.centre[2] for p in adjusted.poses]))
+    reach = [float(np.linalg.norm(p.centre)) for p in adjusted.poses]
+    low, high = PLAUSIBLE_DISTANCE_MM
+    if not low < np.median(reach) < high:
+        remarks.append(
+            ("scale_implausible", f"With this marker edge the photos were taken {distance:.0f} mm above the markers.")
+        )
+    if stage1.subject_mm:
+        ratio = float(np.median(reach)) / stage1.subject_mm
+        if not 1 / SUBJECT_DISAGREES < ratio < SUBJECT_DISAGREES:
+            remarks.append(
+                ("scale_contradicts_exif",
+                 f"The photos' EXIF says {stage1.subject_mm:.0f} mm to the subject, the marker edge "
+                 f"{np.median(reach):.0f} mm: check the edge.")
+            )  # fmt: skip
+    return remarks

@@ -1,0 +1,283 @@
+"""Run the stages: load what is there, call the stage, save, time."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from specimap.core.acquisition import Photo, Refusal, photo_paths, read_photos
+from specimap.core.adjust import adjust
+from specimap.core.cube import Cube, inspect, open_cube
+from specimap.core.errors import CancelledError, OutputExistsError
+from specimap.core.files import disk_errors
+from specimap.core.pipeline.artefacts import (
+    Stage1,
+    Stage2,
+    Store,
+    key_of,
+    load_stage1,
+    load_stage2,
+    save_stage1,
+    save_stage2,
+)
+from specimap.core.pipeline.settings import PipelineSettings
+from specimap.core.reconstruct.backend import ReconstructionBackend, corners_in_photos, detect_in_photos
+from specimap.core.report import Report
+from specimap.core.surface import fuse
+from specimap.core.uncertainty import vertex_sigma
+
+STAGES = ("reconstruct", "adjust", "render", "register")
+MARK = ".specimap"
+"""A file in every output folder; a folder with other files and without it is not written to."""
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """``photos``: a folder; ``cube``: a file; ``white`` and ``dark``: reference frames, where there are some."""
+
+    photos: Path
+    cube: Path
+    white: Path | None = None
+    dark: Path | None = None
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Where a run's results lie."""
+
+    folder: Path
+
+    @property
+    def cloud(self) -> Path:
+        """The spectral cloud."""
+        return self.folder / "cloud.zarr"
+
+    @property
+    def mesh(self) -> Path:
+        """The surface."""
+        return self.folder / "mesh.ply"
+
+    @property
+    def report(self) -> Path:
+        """The report; written last, so that its presence says that the run is whole."""
+        return self.folder / "report.json"
+
+    @property
+    def corners(self) -> Path:
+        """The markers' corners."""
+        return self.folder / "corners.json"
+
+    @property
+    def preview(self) -> Path:
+        """Principal components on the top view."""
+        return self.folder / "preview.png"
+
+    @property
+    def store(self) -> Store:
+        """The stages' artefacts."""
+        return Store(self.folder / "stages")
+
+
+class Clock:
+    """Times the stages, passes progress on, and stops where a stop was asked for."""
+
+    def __init__(self, progress: Progress, cancelled: Callable[[], bool]) -> None:
+        self.seconds: dict[str, float] = {}
+        self.reused: list[str] = []
+        self._progress = progress
+        self._cancelled = cancelled
+
+    def report(self, stage: str, share: float) -> None:
+        """Say how far a stage is.
+
+        Raises:
+            CancelledError: a stop was asked for.
+        """
+        if self._cancelled():
+            raise CancelledError(
+                f"Stopped in stage {stage}.", advice="Run again to go on from the last finished stage.", stage=stage
+            )
+        self._progress(stage, min(max(share, 0.0), 1.0))
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[Callable[[float], None]]:
+        """Time a stage; yields its progress function."""
+        start = time.perf_counter()
+        self.report(name, 0.0)
+        yield lambda share: self.report(name, share)
+        self.seconds[name] = round(time.perf_counter() - start, 3)
+        self.report(name, 1.0)
+
+
+def prepare_folder(folder: Path) -> None:
+    """Make the output folder, or accept one of an earlier run.
+
+    Raises:
+        OutputExistsError: it holds files that Specimap did not write.
+        OutputNotWritableError: it cannot be made or written.
+    """
+    with disk_errors(folder):
+        if folder.exists() and not folder.is_dir():
+            raise OutputExistsError(f"{folder} is a file.", advice="Name a folder for the results.")
+        folder.mkdir(parents=True, exist_ok=True)
+        mark = folder / MARK
+        if not mark.exists() and any(folder.iterdir()):
+            raise OutputExistsError(
+                f"{folder} holds files that Specimap did not write.",
+                advice="Name a new or empty folder, or one of an earlier run.",
+            )
+        mark.write_text("An output folder of Specimap.\n", encoding="utf-8")
+
+
+def run_pipeline(
+    inputs: Inputs,
+    out: Path,
+    settings: PipelineSettings,
+    *,
+    progress: Progress = lambda stage, share: None,
+    cancelled: Callable[[], bool] = lambda: False,
+    workers: int | None = None,
+) -> Report:
+    """Photos and cube to cloud, mesh, corners, preview and report in ``out``.
+
+    Stages whose inputs have not changed since an earlier run into the same folder are not repeated. Raises leaves
+    of SpecimapError; finished stages are kept then.
+    """
+    from specimap.core.pipeline.finish import register_and_write  # its imports are the slow ones
+
+    settings.check()
+    workers = workers or os.cpu_count() or 1
+    paths = photo_paths(inputs.photos)
+    cube = open_cube(inputs.cube, white=inputs.white, dark=inputs.dark)
+    prepare_folder(out)
+    outputs, clock = Outputs(out), Clock(progress, cancelled)
+    with ThreadPoolExecutor(1) as background:
+        # Hashing a cube of a gigabyte takes about a second, which the reconstruction hides.
+        fingerprint = background.submit(cube.fingerprint)
+        # Inspecting it early refuses a useless cube before minutes of work.
+        mean = cube.mean_image()
+        remarks = [*cube.warnings, *inspect(cube, mean)]
+        with ThreadPoolExecutor(workers) as pool:
+            digests = {p.name: d for p, d in zip(paths, pool.map(_digest, paths), strict=True)}
+        key1 = key_of(
+            "reconstruct",
+            {"photos": digests, "acquisition": asdict(settings.acquisition), "s": asdict(settings.reconstruct)},
+        )
+        stage1 = _reconstruct(paths, settings, outputs.store, key1, clock, workers)
+        key2 = key_of(
+            "adjust", {"before": key1, "s": asdict(settings.adjust), "surface": asdict(settings.surface)}
+        )
+        stage2 = _adjust(stage1, settings, outputs.store, key2, clock)
+        key4 = key_of(
+            "register",
+            {"before": key2, "cube": fingerprint.result(), "render": asdict(settings.render),
+             "s": asdict(settings.register)},
+        )  # fmt: skip
+        done = _finished(outputs, key4)
+        if done is not None:
+            for name in ("render", "register"):
+                clock.report(name, 1.0)
+            return done
+        return register_and_write(
+            stage1, stage2, cube, settings, outputs, clock, remarks,
+            {"key": key4, "cube": fingerprint.result(), "photos": _together(digests)},
+        )  # fmt: skip
+
+
+def backend_named(name: str) -> ReconstructionBackend:
+    """The backend of that name; settings have been checked."""
+    from specimap.core.reconstruct.colmap import ColmapBackend
+
+    return {"colmap": ColmapBackend}[name]()
+
+
+def _digest(path: Path) -> str:
+    with open(path, "rb") as f:
+        return hashlib.file_digest(f, "sha256").hexdigest()
+
+
+def _together(digests: dict[str, str]) -> str:
+    return hashlib.sha256(json.dumps(digests, sort_keys=True).encode()).hexdigest()
+
+
+def _finished(outputs: Outputs, key: str) -> Report | None:
+    """The report of an earlier run with the same inputs and settings, if all its results are there."""
+    if not all(p.exists() for p in (outputs.cloud, outputs.mesh, outputs.corners, outputs.preview)):
+        return None
+    try:
+        report = Report.model_validate_json(outputs.report.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return report if report.inputs.get("key") == key else None
+
+
+def _reconstruct(
+    paths: list[Path], settings: PipelineSettings, store: Store, key: str, clock: Clock, workers: int
+) -> Stage1:
+    with clock.stage("reconstruct") as progress:
+        found = load_stage1(store, key)
+        if found is not None:
+            clock.reused.append("reconstruct")
+            return found
+        photos, refused = read_photos(
+            paths, settings.acquisition, workers=workers, progress=lambda s: progress(0.08 * s)
+        )
+        detections = detect_in_photos(
+            photos, settings.reconstruct.dictionary, workers=workers, progress=lambda s: progress(0.08 + 0.12 * s)
+        )
+        corners = corners_in_photos(photos, detections, settings.reconstruct.dictionary)
+        reconstruction = backend_named(settings.reconstruct.backend).reconstruct(
+            photos,
+            corners,
+            replace(settings.reconstruct, edge_mm=settings.adjust.edge_mm),
+            workers=workers,
+            progress=lambda s: progress(0.2 + 0.8 * s),
+        )
+        stage = Stage1(
+            reconstruction, corners, tuple(p.name for p in photos), tuple(refused), _subject_mm(photos)
+        )
+        save_stage1(store, key, stage)
+        return stage
+
+
+def _subject_mm(photos: list[Photo]) -> float | None:
+    stated = [p.subject_mm for p in photos if p.subject_mm]
+    return float(np.median(stated)) if stated else None
+
+
+def _adjust(stage1: Stage1, settings: PipelineSettings, store: Store, key: str, clock: Clock) -> Stage2:
+    with clock.stage("adjust") as progress:
+        found = load_stage2(store, key)
+        if found is not None:
+            clock.reused.append("adjust")
+            return found
+        r = stage1.reconstruction
+        seen = stage1.corners.seen
+        place = {photo: k for k, photo in enumerate(r.photos)}
+        posed = seen.of(np.isin(seen.photo, r.photos))
+        posed = replace(posed, photo=np.array([place[int(p)] for p in posed.photo]))
+        adjusted = adjust(r.lens, r.poses, posed, stage1.corners.marker_ids, settings.adjust)
+        maps = tuple(replace(m, depth=m.depth * np.float32(adjusted.scale)) for m in r.maps)
+        mesh = fuse(list(maps), adjusted.poses, settings.surface, progress=lambda s: progress(0.05 + 0.85 * s))
+        stage = Stage2(adjusted, mesh, vertex_sigma(mesh, maps, adjusted.poses).astype(float))
+        save_stage2(store, key, stage)
+        return stage
+
+
+def all_refused(stage1: Stage1) -> list[Refusal]:
+    """Photos refused while reading and while reconstructing."""
+    return [*stage1.refused, *stage1.reconstruction.refused]
+
+
+__all__ = ["Clock", "Cube", "Inputs", "Outputs", "all_refused", "prepare_folder", "run_pipeline"]

@@ -1,0 +1,63 @@
+"""All knobs of a run, grouped by stage; the published values are the defaults."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+
+from specimap.core.acquisition import AcquisitionSettings
+from specimap.core.adjust import AdjustSettings
+from specimap.core.errors import SettingsError
+from specimap.core.fiducials import dictionary_named
+from specimap.core.reconstruct.backend import ReconstructSettings
+from specimap.core.register.register import RegisterSettings
+from specimap.core.render import RenderSettings
+from specimap.core.surface import SurfaceSettings
+
+BACKENDS = ("colmap",)
+
+
+@dataclass(frozen=True)
+class PipelineSettings:
+    """Settings of the four stages."""
+
+    acquisition: AcquisitionSettings = field(default_factory=AcquisitionSettings)
+    reconstruct: ReconstructSettings = field(default_factory=ReconstructSettings)
+    adjust: AdjustSettings = field(default_factory=AdjustSettings)
+    surface: SurfaceSettings = field(default_factory=SurfaceSettings)
+    render: RenderSettings = field(default_factory=RenderSettings)
+    register: RegisterSettings = field(default_factory=RegisterSettings)
+
+    def check(self) -> None:
+        """Refuse values that cannot work, before anything is read.
+
+        Raises:
+            SettingsError: a value is out of its range; details name it.
+            UnknownDictionaryError: there is no such marker dictionary.
+        """
+        dictionary_named(self.reconstruct.dictionary)
+        positive = {
+            "edge_mm": self.adjust.edge_mm,
+            "r_reg": self.render.r_reg_mm,
+            "r_pc": self.render.r_pc_mm,
+            "working_px": self.acquisition.working_px,
+            "voxel_mm": self.surface.voxel_mm,
+        }
+        for name, value in positive.items():
+            if not 0 < value < 1e6:
+                raise SettingsError(
+                    f"{name} is {value}; it must be above 0.", advice="Give a positive number.", setting=name
+                )
+        choices = {
+            "backend": (self.reconstruct.backend, BACKENDS),
+            "method": (self.register.method, ("camera", "homography")),
+            "adjustment": (self.adjust.form, ("rigid", "free")),
+        }
+        for name, (chosen, known) in choices.items():
+            if chosen not in known:
+                raise SettingsError(
+                    f"There is no {name} {chosen!r}.", advice=f"Choose one of: {', '.join(known)}.", setting=name
+                )
+
+    def as_dict(self) -> dict[str, object]:
+        """JSON-ready."""
+        return asdict(self)

@@ -1,0 +1,84 @@
+"""From placements on the surface to the cloud's points: which lie on the specimen, on a card, are doubtful."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from specimap.core.cloud import CloudPoints, Flag
+from specimap.core.geometry import Floats
+from specimap.core.raycast import RayCaster
+from specimap.core.register.register import GRAZING_DEG, Placement
+from specimap.core.uncertainty import UNSEEN_SIGMA_MM, point_sigma
+
+CARD_OVER_MARKER = 1.5
+"""Edge of a card over that of its marker (10.2 mm over 6.8 mm in the published layout)."""
+CARD_HEIGHT_MM = 1.0
+SPECIMEN_HEIGHT_SHARE = 0.012
+"""A specimen's points rise above the marker plane by more than this share of the layout's diagonal."""
+INTERPOLATED_SIGMA_MM = 0.9
+
+
+def on_card(xyz: NDArray[np.float32], corners: Floats) -> NDArray[np.bool_]:
+    """Whether points (S, 3) lie on one of the cards, whose markers have corners (Q, 4, 3) mm."""
+    found = np.zeros(len(xyz), bool)
+    for square in corners:
+        centre = square.mean(0)
+        x, y = square[1] - square[0], square[0] - square[3]
+        half = float(np.linalg.norm(x)) / 2 * CARD_OVER_MARKER
+        away = xyz - centre
+        u, v = away @ (x / np.linalg.norm(x)), away @ (y / np.linalg.norm(y))
+        w = away @ (np.cross(x, y) / np.linalg.norm(np.cross(x, y)))
+        found |= (np.abs(u) < half) & (np.abs(v) < half) & (np.abs(w) < CARD_HEIGHT_MM)
+    return found
+
+
+def on_specimen(
+    pixels: NDArray[np.uint16], xyz: NDArray[np.float32], card: NDArray[np.bool_], corners: Floats
+) -> NDArray[np.bool_]:
+    """Whether points (S, 3) of cube pixels (S, 2) are of the specimen: the largest raised part between the cards,
+    with what touches it in the cube."""
+    if not len(xyz):
+        return np.zeros(0, bool)
+    diagonal = float(np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0)))
+    raised = (xyz[:, 2] > SPECIMEN_HEIGHT_SHARE * diagonal) & ~card
+    shape = pixels.max(0).astype(int) + 1
+    mask = np.zeros(shape, np.uint8)
+    mask[pixels[raised, 0], pixels[raised, 1]] = 1
+    mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    _, parts, statistics, _ = cv2.connectedComponentsWithStats(mask)
+    if len(statistics) < 2:
+        return np.zeros(len(xyz), bool)
+    largest = int(statistics[1:, cv2.CC_STAT_AREA].argmax()) + 1
+    return np.asarray((parts[pixels[:, 0], pixels[:, 1]] == largest) & ~card)
+
+
+def cloud_points(
+    placement: Placement,
+    caster: RayCaster,
+    sigma_of_vertex: NDArray[np.float32],
+    corners: Floats,
+    corner_sigma_mm: float,
+    registration_mm: float,
+) -> CloudPoints:
+    """The cloud's points with their flags and standard deviations."""
+    if (placement.triangle >= 0).all():
+        depth_sigma = caster.interpolate(
+            sigma_of_vertex[:, None], placement.triangle, placement.barycentric
+        ).ravel()
+    else:
+        depth_sigma = np.full(len(placement.xyz), np.float32(np.median(sigma_of_vertex)))
+    sigma = point_sigma(depth_sigma, placement.incidence_deg, corner_sigma_mm, registration_mm)
+    card = on_card(placement.xyz, corners)
+    specimen = on_specimen(placement.pixels, placement.xyz, card, corners)
+    flags = (
+        specimen * np.uint8(Flag.SPECIMEN)
+        + card * np.uint8(Flag.MARKER_CARD)
+        + (placement.incidence_deg > GRAZING_DEG) * np.uint8(Flag.GRAZING)
+        + placement.occluded * np.uint8(Flag.OCCLUDED)
+        + (depth_sigma > INTERPOLATED_SIGMA_MM * UNSEEN_SIGMA_MM) * np.uint8(Flag.DEPTH_INTERPOLATED)
+    ).astype(np.uint8)
+    return CloudPoints(
+        placement.pixels, placement.xyz, placement.normal, placement.rgb, sigma, flags
+    )

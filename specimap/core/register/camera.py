@@ -1,0 +1,97 @@
+"""The cube's camera from marker corners alone: pose and unknown focal length, without calibration.
+
+Cards need not be coplanar: each start is a general PnP (SQPNP, Terzakis and Lourakis 2020) for a given focal
+length; pose and focal length are then refined together. Nearly coplanar corners leave the focal
+length 10-20 % loose, which the distance makes good: what remains is a few hundredths of a millimetre at the height
+of a specimen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.optimize import least_squares
+
+from specimap.core.errors import RegistrationError
+from specimap.core.geometry import Floats, Intrinsics, Pose, View, rotation_from_vector
+
+FOCAL_RANGE = (0.7, 30.0)
+"""Focal lengths tried, in widths of the cube."""
+FOCAL_STARTS = 24
+FOCAL_PRIOR_SD = 0.7
+"""Standard deviation of the logarithm of the focal length about what the start found; only keeps it finite."""
+
+
+@dataclass(frozen=True)
+class CubeCamera:
+    """The solved camera: ``view``; RMS corner distance ``rms_px``; ``focal_sd``: one standard deviation of the
+    logarithm of the focal length, as the corners determine it; ``covariance`` (7, 7) of rotation, translation
+    and log focal length."""
+
+    view: View
+    rms_px: float
+    focal_sd: float
+    covariance: Floats
+
+
+def solve_camera(
+    corners: Floats, corners_px: Floats, sigma_px: Floats, rows: int, cols: int, *, focal_px: float | None = None
+) -> CubeCamera:
+    """Solve the camera that sees ``corners`` (N, 3) mm at ``corners_px`` (N, 2); ``sigma_px`` (N,).
+
+    With ``focal_px`` the focal length is held, else it is an unknown.
+
+    Raises:
+        RegistrationError: no camera above the plane sees the corners there.
+    """
+    starts = (
+        [focal_px] if focal_px else list(np.geomspace(*FOCAL_RANGE, FOCAL_STARTS) * max(rows, cols))
+    )
+    best: tuple[float, Pose, float] | None = None
+    for focal in starts:
+        lens = Intrinsics.centred(cols, rows, focal)
+        ok, rvec, tvec = cv2.solvePnP(
+            corners, corners_px[:, None], lens.matrix, None, flags=cv2.SOLVEPNP_SQPNP
+        )
+        if not ok or not np.isfinite(tvec).all():
+            continue
+        pose = Pose(rotation_from_vector(rvec.ravel()), tvec.ravel())
+        if pose.centre[2] <= 0 or pose.apply(corners)[:, 2].min() <= 0:
+            continue
+        miss = View(lens, pose).project(corners) - corners_px
+        cost = float((miss**2).sum())
+        if best is None or cost < best[0]:
+            best = cost, pose, focal
+    if best is None:
+        raise RegistrationError(
+            "No camera above the markers sees them as the cube does.",
+            advice="Check that cube and photos show the same, unmoved markers.",
+        )
+    return _refine(corners, corners_px, sigma_px, Intrinsics.centred(cols, rows, best[2]), best[1], focal_px is None)
+
+
+def _refine(
+    corners: Floats, corners_px: Floats, sigma_px: Floats, lens: Intrinsics, pose: Pose, free_focal: bool
+) -> CubeCamera:
+    start_focal = lens.focal_px
+    weight = 1 / np.maximum(sigma_px, 1e-3)[:, None]
+
+    def unpack(x: Floats) -> View:
+        focal = start_focal * float(np.exp(x[6])) if free_focal else start_focal
+        turned = Pose(rotation_from_vector(x[:3]) @ pose.R, pose.t * np.exp(x[6]) + x[3:6])
+        return View(Intrinsics.centred(lens.width, lens.height, focal), turned)
+
+    def residual(x: Floats) -> Floats:
+        miss = (unpack(x).project(corners) - corners_px) * weight
+        # The distance follows the focal length, which the prior keeps from running to infinity.
+        return np.append(miss.ravel(), x[6] / (FOCAL_PRIOR_SD if free_focal else 1e-3))
+
+    answer = least_squares(residual, np.zeros(7), x_scale=np.array([1e-3] * 3 + [1.0] * 3 + [0.1]), loss="soft_l1")
+    view = unpack(answer.x)
+    miss = view.project(corners) - corners_px
+    rms = float(np.sqrt((miss**2).sum(-1).mean()))
+    scatter = float(((miss * weight) ** 2).sum()) / max(2 * len(corners) - 7, 1)
+    covariance = np.linalg.pinv(answer.jac.T @ answer.jac) * max(1.0, scatter)
+    return CubeCamera(view, rms, float(np.sqrt(covariance[6, 6])), covariance)
