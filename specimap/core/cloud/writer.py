@@ -160,6 +160,10 @@ class _ArrayWriter:
         while len(values):
             room = self._shard - start % self._shard
             part, values = values[:room], values[room:]
+            if self._committing and start % self._shard >= self._shard // 4:
+                # The shard before must be gone before this one grows large, so that memory stays bounded.
+                self._committing.result()
+                self._committing = None
             self._open = self._open or tensorstore.Transaction()
             target = self._array.with_transaction(self._open)[start : start + len(part)]
             target.write(part).copy.result()
@@ -184,7 +188,7 @@ class _ArrayWriter:
             self._committing.exception()
 
     def _commit(self) -> None:
-        # At most one shard is under way, so that memory stays bounded.
+        # At most one shard is under way.
         if self._committing:
             self._committing.result()
         self._committing = self._open.commit_async() if self._open else None
