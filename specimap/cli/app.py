@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import sys
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -16,8 +20,11 @@ from specimap.cli.progress import Listener, json_listener, progress_listener
 from specimap.core.errors import CancelledError, NotFoundError, SpecimapError
 
 REFUSED = 2
-"""Exit status of a refused input; 1 is left to failures of the program itself."""
+"""Exit status of a refused input."""
+FAILED = 1
+"""Exit status where the program itself failed: an error that nobody foresaw."""
 STOPPED = 130
+DEBUG_VARIABLE = "SPECIMAP_DEBUG"
 
 app = typer.Typer(
     add_completion=False,
@@ -57,6 +64,11 @@ class Format(StrEnum):
     csv = "csv"
 
 
+Debug = Annotated[
+    bool, typer.Option("--debug", envvar=DEBUG_VARIABLE, help="Print the traceback of an unforeseen error.")
+]
+
+
 @app.command()
 def run(
     photos: Annotated[Path, typer.Option(help="Folder of the photos (JPEG, PNG, TIFF, HEIC).")],
@@ -77,17 +89,15 @@ def run(
     backend: Annotated[Backend, typer.Option(help="Reconstruction backend.")] = Backend.colmap,
     working_px: Annotated[int, typer.Option(help="Longer side that larger photos are brought to.")] = 1280,
     json_events: Annotated[bool, typer.Option("--json", help="One JSON line per event instead of a bar.")] = False,
+    debug: Debug = False,
 ) -> None:
     """Reconstruct, adjust, render, register; write cloud.zarr, mesh.ply, report.json, corners.json, preview.png."""
-    # Imported late: `specimap --help` and `specimap info` need none of the 3D libraries.
-    from specimap.cli.options import settings_from
-    from specimap.core.pipeline import Inputs, Outputs, run_pipeline
-
     listener: Listener = json_listener() if json_events else progress_listener()
-    stop = {"asked": False}
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.update(asked=True))
-    try:
+    with _told(listener, debug), _stoppable() as stop_asked:
+        # Imported late: `specimap --help` and `specimap info` need none of the 3D libraries.
+        from specimap.cli.options import settings_from
+        from specimap.core.pipeline import Inputs, Outputs, run_pipeline
+
         settings = settings_from(
             edge_mm=edge_mm, dictionary=dictionary, method=method.value, adjustment=adjustment.value, r_pc=r_pc,
             r_reg=r_reg, backend=backend.value, working_px=working_px,
@@ -98,34 +108,36 @@ def run(
                 out,
                 settings,
                 progress=listener.progress,
-                cancelled=lambda: stop["asked"],
+                cancelled=stop_asked,
             )
         listener.finished(report, Outputs(out))
-    except SpecimapError as error:
-        listener.refused(error)
-        raise typer.Exit(STOPPED if isinstance(error, CancelledError) else REFUSED) from None
 
 
 @app.command()
 def info(
     out: Annotated[Path, typer.Argument(help="Folder of a run.")],
     json_events: Annotated[bool, typer.Option("--json", help="Print report.json as it is.")] = False,
+    debug: Debug = False,
 ) -> None:
     """Print the report of a run."""
-    from specimap.cli.tables import print_report
-    from specimap.core.report import Report
+    with _told(json_listener() if json_events else progress_listener(), debug):
+        from specimap.cli.tables import print_report
+        from specimap.core.report import Report
 
-    path = out / "report.json"
-    try:
+        path = out / "report.json"
         if not path.is_file():
             raise NotFoundError(f"{out} holds no report.", advice="Name the folder of a finished run.")
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8", errors="replace")
+        try:
+            report = Report.model_validate_json(text)
+        except ValueError as error:
+            raise NotFoundError(
+                f"{path} is not a report that this version of Specimap reads.", advice="Repeat the run."
+            ) from error
         if json_events:
             sys.stdout.write(text + "\n")
         else:
-            print_report(Report.model_validate_json(text))
-    except SpecimapError as error:
-        _refuse(error, json_events)
+            print_report(report)
 
 
 @app.command()
@@ -134,26 +146,63 @@ def export(
     format: Annotated[Format, typer.Option(help="What to write.")],
     target: Annotated[Path | None, typer.Option(help="Where to; by default beside the cloud.")] = None,
     json_events: Annotated[bool, typer.Option("--json", help="Answer in one JSON line.")] = False,
+    debug: Debug = False,
 ) -> None:
     """Write the cloud in another format."""
-    from specimap.core.cloud import Cloud
-    from specimap.core.export import export_cloud
+    with _told(json_listener() if json_events else progress_listener(), debug):
+        from specimap.core.cloud import Cloud
+        from specimap.core.export import export_cloud
 
-    try:
         cloud = Cloud.open(out / "cloud.zarr")
         suffix = "hdr" if format is Format.envi else format.value
         written = export_cloud(cloud, target or out / f"cloud.{suffix}", format.value)
+        if json_events:
+            sys.stdout.write(json.dumps({"event": "exported", "path": str(written)}) + "\n")
+        else:
+            typer.echo(f"Wrote {written}")
+
+
+@contextmanager
+def _stoppable() -> Iterator[Callable[[], bool]]:
+    """Let SIGINT and SIGTERM ask for a stop at the next step; asked twice, the program ends at once."""
+    asked: list[int] = []
+
+    def stop(number: int, _: object) -> None:
+        asked.append(number)
+        signal.signal(number, signal.SIG_DFL)
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(asked)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _told(listener: Listener, debug: bool) -> Iterator[None]:
+    """Tell of any error by its code and advice, never by a traceback, and exit accordingly."""
+    try:
+        yield
     except SpecimapError as error:
-        _refuse(error, json_events)
-    if json_events:
-        sys.stdout.write(json.dumps({"event": "exported", "path": str(written)}) + "\n")
-    else:
-        typer.echo(f"Wrote {written}")
-
-
-def _refuse(error: SpecimapError, json_events: bool) -> None:
-    (json_listener() if json_events else progress_listener()).refused(error)
-    raise typer.Exit(REFUSED)
+        if debug:
+            traceback.print_exc()
+        listener.refused(error)
+        raise typer.Exit(STOPPED if isinstance(error, CancelledError) else REFUSED) from None
+    except BrokenPipeError:
+        # Who reads the output has gone; Python would complain once more when it flushes at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise typer.Exit(FAILED) from None
+    except Exception as error:
+        if debug:
+            traceback.print_exc()
+        listener.refused(
+            SpecimapError(
+                f"An error that Specimap does not know: {type(error).__name__}: {error}",
+                advice=f"Repeat with {DEBUG_VARIABLE}=1 and report what it prints. Finished stages are kept.",
+            )
+        )
+        raise typer.Exit(FAILED) from None
 
 
 def _version(asked: bool) -> None:

@@ -8,6 +8,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Protocol, Self
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from specimap.cli.tables import print_report
@@ -76,9 +77,10 @@ class _Bars:
             sys.stdout.write(f"{name:<8} {getattr(outputs, name)}\n")
 
     def refused(self, error: SpecimapError) -> None:
-        self._console.print(f"[bold red]{error.code}[/]: {error.message}", highlight=False, soft_wrap=True)
+        # Paths may hold square brackets, which rich would take for markup.
+        self._console.print(f"[bold red]{error.code}[/]: {escape(error.message)}", highlight=False, soft_wrap=True)
         if error.advice:
-            self._console.print(error.advice, highlight=False, soft_wrap=True)
+            self._console.print(escape(error.advice), highlight=False, soft_wrap=True)
 
 
 class _Lines:

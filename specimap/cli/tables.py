@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from specimap.core.report import LeaveOneOut, Report
@@ -33,8 +34,8 @@ def print_report(report: Report) -> None:
     rows.add_row("method, backend, adjustment", f"{report.method}, {report.backend}, {report.adjustment}")
     rows.add_row("photos used", f"{len(photos.used)} of {photos.given}")
     for refused in photos.refused:
-        rows.add_row(f"  refused {refused.name}", f"{refused.code}: {refused.reason}")
-    rows.add_row("markers in photos, in cube", f"{report.marker_ids}, {report.marker_ids_in_cube}")
+        rows.add_row(f"  refused {escape(refused.name)}", escape(f"{refused.code}: {refused.reason}"))
+    rows.add_row("markers in photos, in cube", escape(f"{report.marker_ids}, {report.marker_ids_in_cube}"))
     rows.add_row("marker edge, mm", f"{edge.mean:.4f} ± {edge.std:.4f} (known: {edge.expected})")
     rows.add_row(
         "corners in photos, RMS px", f"{report.reprojection_px.before:.3f} -> {report.reprojection_px.after:.3f}"
@@ -50,5 +51,5 @@ def print_report(report: Report) -> None:
     if report.reused_stages:
         rows.add_row("taken from an earlier run", ", ".join(report.reused_stages))
     for warning in report.warnings:
-        rows.add_row(f"[yellow]{warning.code}[/]", warning.message)
+        rows.add_row(f"[yellow]{warning.code}[/]", escape(warning.message))
     console.print(rows)

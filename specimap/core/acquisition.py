@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 import io
 import math
+from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -21,7 +22,14 @@ from specimap.core.errors import NotFoundError, PhotoUnreadableError, TooFewPhot
 register_heif_opener()
 
 PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".heic", ".heif"})
+PHOTO_FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "HEIF")
+"""Whatever a file is called, Pillow's other parsers (PostScript among them) do not get to see it."""
 LARGEST_PHOTO_PIXELS = 250_000_000
+# Pillow's own limit warns at 90 million pixels, which phones exceed, and on standard error; photos are judged by
+# the limit above before they are decoded.
+Image.MAX_IMAGE_PIXELS = None
+QUARTER_TURNS = {3: 2, 4: 2, 5: 1, 6: 1, 7: 3, 8: 3}
+"""Clockwise quarter turns by which an EXIF orientation is turned upright."""
 RECOMMENDED_PHOTOS = 20
 FULL_FRAME_DIAGONAL_MM = math.hypot(36, 24)
 
@@ -40,7 +48,8 @@ class Photo:
 
     ``image`` (H, W, 3) sRGB uint8 at working size; ``full_size`` (width, height) upright pixels of the file;
     ``focal_px`` from EXIF in working pixels, None where there is none; ``subject_mm`` distance stated by EXIF;
-    ``sharpness``: variance of the Laplacian over the variance of the image; ``digest``: sha256 of the file.
+    ``sharpness``: variance of the Laplacian over the variance of the image; ``digest``: sha256 of the file;
+    ``quarter_turns``: by how many, clockwise, the pixels were turned from how the sensor read them.
     """
 
     name: str
@@ -50,6 +59,17 @@ class Photo:
     subject_mm: float | None
     sharpness: float
     digest: str
+    quarter_turns: int = 0
+
+    def turned(self, quarter_turns: int) -> Photo:
+        """The photo turned clockwise in its plane."""
+        width, height = self.full_size
+        return replace(
+            self,
+            image=np.ascontiguousarray(np.rot90(self.image, -quarter_turns)),
+            full_size=(height, width) if quarter_turns % 2 else (width, height),
+            quarter_turns=(self.quarter_turns + quarter_turns) % 4,
+        )
 
     @property
     def size(self) -> tuple[int, int]:
@@ -99,9 +119,9 @@ def read_photo(path: Path, settings: AcquisitionSettings) -> Photo:
     Raises:
         PhotoUnreadableError: it is not an image, is cut off, or is absurdly large.
     """
-    data = path.read_bytes()
     try:
-        with Image.open(io.BytesIO(data)) as opened:
+        data = path.read_bytes()
+        with Image.open(io.BytesIO(data), formats=PHOTO_FORMATS) as opened:
             width, height = opened.size
             if width * height > LARGEST_PHOTO_PIXELS:
                 raise PhotoUnreadableError(
@@ -114,26 +134,28 @@ def read_photo(path: Path, settings: AcquisitionSettings) -> Photo:
             opened.draft("RGB", (settings.working_px, settings.working_px))
             upright = ImageOps.exif_transpose(opened)
             image = _eight_bit(upright)
+            details = exif.get_ifd(ExifTags.IFD.Exif)
     except PhotoUnreadableError:
         raise
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except Exception as error:
+        # Not a list of types: on damaged files the decoders raise anything, ZeroDivisionError included.
         raise PhotoUnreadableError(
             f"{path.name} does not decode as an image ({_reason(error)}).",
             advice="Copy the photo from the phone again, or take it again.",
             photo=path.name,
         ) from error
-    if exif.get(ExifTags.Base.Orientation, 1) in (5, 6, 7, 8):
+    turns = QUARTER_TURNS.get(exif.get(ExifTags.Base.Orientation, 1), 0)
+    if turns % 2:
         width, height = height, width
     longer = max(image.shape[:2])
     if longer > settings.working_px:
         factor = settings.working_px / longer
         size = (round(image.shape[1] * factor), round(image.shape[0] * factor))
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-    details = exif.get_ifd(ExifTags.IFD.Exif)
     return Photo(
         path.name, np.ascontiguousarray(image), (width, height),
         _focal_px(details, image.shape[1], image.shape[0]), _subject_mm(details), sharpness_of(image),
-        hashlib.sha256(data).hexdigest(),
+        hashlib.sha256(data).hexdigest(), turns,
     )  # fmt: skip
 
 
@@ -186,7 +208,9 @@ def read_photos(
 ) -> tuple[list[Photo], list[Refusal]]:
     """Read photos; those that do not decode, or repeat another, are refused by name.
 
-    All photos are brought to the size of the majority's camera: one of another shape is foreign.
+    Photos of one camera held upright and across come in two shapes. One lens for all wants one shape, and nothing
+    later cares how a photo is rolled, so those of the rarer shape are turned by 90 degrees, back to how the sensor
+    read them where EXIF tells. Photos of yet another size are foreign.
 
     Raises:
         PhotoUnreadableError: too few are left because photos do not decode.
@@ -214,17 +238,8 @@ def read_photos(
                 seen[result.digest] = result.name
                 photos.append(result)
             progress(done / len(paths))
-    shapes: dict[tuple[int, int], int] = {}
-    for photo in photos:
-        shapes[photo.full_size] = shapes.get(photo.full_size, 0) + 1
-    if shapes:
-        usual = max(shapes, key=lambda s: shapes[s])
-        for photo in photos:
-            if photo.full_size != usual:
-                w, h = photo.full_size
-                reason = f"It has {w} x {h} pixels, the others {usual[0]} x {usual[1]}: another camera."
-                refused.append(Refusal(photo.name, "photo_foreign", reason))
-        photos = [p for p in photos if p.full_size == usual]
+    photos, foreign = _of_one_shape(photos)
+    refused += foreign
     if len(photos) < settings.least_photos:
         unreadable = [r for r in refused if r.code == PhotoUnreadableError.code]
         leaf = PhotoUnreadableError if unreadable else TooFewPhotosError
@@ -236,3 +251,26 @@ def read_photos(
             refused={r.name: r.reason for r in refused},
         )
     return photos, refused
+
+
+def _of_one_shape(photos: list[Photo]) -> tuple[list[Photo], list[Refusal]]:
+    """Turn photos into the shape that most have; refuse those of another size."""
+    shapes = Counter(p.full_size for p in photos)
+    if len(shapes) < 2:
+        return photos, []
+    # A camera's pictures count together, however it was held.
+    usual = max(shapes, key=lambda s: (shapes[s] + shapes[s[::-1]] * (s[0] != s[1]), shapes[s]))
+    turns = Counter(p.quarter_turns for p in photos if p.full_size == usual).most_common(1)[0][0]
+    kept: list[Photo] = []
+    refused: list[Refusal] = []
+    for photo in photos:
+        w, h = photo.full_size
+        if (w, h) == usual:
+            kept.append(photo)
+        elif (h, w) == usual:
+            by = (turns - photo.quarter_turns) % 4
+            kept.append(photo.turned(by if by % 2 else 1))
+        else:
+            reason = f"It has {w} x {h} pixels, the others {usual[0]} x {usual[1]}: another camera."
+            refused.append(Refusal(photo.name, "photo_foreign", reason))
+    return kept, refused

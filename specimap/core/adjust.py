@@ -12,13 +12,13 @@ from typing import Literal
 
 import numpy as np
 
+from specimap.core.covariance import corner_covariance
 from specimap.core.errors import MarkerGeometryError
 from specimap.core.geometry import Floats, Intrinsics, Pose, fit_similarity
 from specimap.core.layout import edge_lengths, marker_frame, rigid_square
 from specimap.core.solver import (
     MarkerScene,
     Observations,
-    corner_covariance,
     corners_of,
     rms_px,
     solve,
@@ -98,7 +98,7 @@ def adjust(
         MarkerGeometryError: no marker is seen by two photos.
     """
     first = triangulate(lens, poses, seen, len(marker_ids))
-    known = np.isfinite(first).all(axis=(1, 2))
+    known = np.asarray(np.isfinite(first).all(axis=(1, 2)), bool)
     if not known.any():
         raise MarkerGeometryError(
             "No marker is seen by two posed photos.",
@@ -159,5 +159,5 @@ def _in_frame(covariance: Floats, R: Floats) -> Floats:
     """Rotate a covariance (3 N, 3 N) of N points by R."""
     n = len(covariance) // 3
     blocks = covariance.reshape(n, 3, n, 3)
-    return np.einsum("ij,ajbk,lk->aibl", R, blocks, R).reshape(3 * n, 3 * n)
+    return np.asarray(np.einsum("ij,ajbk,lk->aibl", R, blocks, R).reshape(3 * n, 3 * n))
 

@@ -7,6 +7,8 @@ profiles across them in linear light, a line is fitted to each, and neighbouring
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -15,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specimap.core.errors import UnknownDictionaryError
-from specimap.core.geometry import Floats
+from specimap.core.geometry import Array, Floats
 
 Bytes = NDArray[np.uint8]
 
@@ -87,7 +89,7 @@ def _detector(dictionary: str) -> cv2.aruco.ArucoDetector:
 
 
 def detect_markers(
-    grey: Bytes, dictionary: str, *, expected: int | None = None, linear: Floats | None = None
+    grey: Bytes, dictionary: str, *, expected: int | None = None, linear: NDArray[np.float32] | None = None
 ) -> list[Detection]:
     """Find markers and measure their corners.
 
@@ -108,7 +110,7 @@ def detect_markers(
         sharp = cv2.addWeighted(big, 1.8, cv2.GaussianBlur(big, (0, 0), 3), -0.8, 0)
         quads, ids, _ = detector.detectMarkers(sharp)
         found = _collect(found, quads, ids, 2.0)
-    light = linear_from_srgb(grey) if linear is None else linear.astype(np.float32)
+    light = linear_from_srgb(grey) if linear is None else linear
     refined = (refine_corners(light, quad) for _, quad in found)
     return [
         Detection(marker_id, corners, sigma)
@@ -118,7 +120,7 @@ def detect_markers(
 
 def _collect(
     found: list[tuple[int, Floats]],
-    quads: tuple[Floats, ...],
+    quads: Sequence[Array],
     ids: NDArray[np.int32] | None,
     enlarged: float,
 ) -> list[tuple[int, Floats]]:
@@ -219,12 +221,14 @@ def _fit_edge(
 
 
 def fitting_dictionaries(images: list[Bytes]) -> dict[str, int]:
-    """Dictionaries that do decode in ``images`` (each (H, W) uint8), with the markers found, most first.
+    """Dictionaries that do decode in ``images`` (each (H, W) uint8), with the sightings, most first, of ids
+    that two images share.
 
     A name ends in the family's largest size; smaller members of the family hold its first ids.
     """
-    votes = {
-        name: sum(len(detect_markers(image, name, expected=0)) for image in images)
-        for name in DICTIONARY_TRIALS
-    }
-    return dict(sorted(((n, v) for n, v in votes.items() if v >= 2), key=lambda pair: -pair[1]))
+    votes: dict[str, int] = {}
+    for name in DICTIONARY_TRIALS:
+        shown = Counter(i for image in images for i in {d.marker_id for d in detect_markers(image, name, expected=0)})
+        # Texture decodes as a marker now and then, but not twice as the same one.
+        votes[name] = sum(n for n in shown.values() if n >= 2)
+    return dict(sorted(((n, v) for n, v in votes.items() if v), key=lambda pair: -pair[1]))

@@ -60,6 +60,12 @@ def replace(aside: Path, target: Path) -> None:
         os.replace(aside, target)
 
 
+def remove_leftovers(folder: Path) -> None:
+    """Remove what killed writers left aside in ``folder``; only one writer may work there at a time."""
+    for path in folder.glob(".*.tmp"):
+        remove(path)
+
+
 def remove(path: Path) -> None:
     """Remove a file or folder if it is there."""
     if path.is_dir() and not path.is_symlink():

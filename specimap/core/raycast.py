@@ -88,4 +88,4 @@ class RayCaster:
         """sRGB (N, 3) at hits; 0 for none."""
         rgb = self.interpolate(self.mesh.colours.astype(np.float32), hits.triangle, hits.barycentric)
         rgb[~hits.hit] = 0
-        return np.clip(rgb + 0.5, 0, 255).astype(np.uint8)
+        return np.asarray(np.clip(rgb + 0.5, 0, 255), np.uint8)

@@ -1,4 +1,4 @@
-"""The least squares behind stages 1 and 2: cameras and markers from marker corners, and its covariance.
+"""The least squares behind stages 1 and 2: cameras and markers from marker corners.
 
 Unknowns: a shared lens (focal length, principal point, two radial terms), a pose per photo, and the markers,
 either rigid squares of known edge (a pose each) or four free points each. Derivatives are analytic; the normal
@@ -146,7 +146,9 @@ def _descend(
     current = system(scene)
     for taken in range(1, iterations + 1):  # noqa: B007
         H, g, cost, _ = current
-        step = np.linalg.solve(H + np.diag(damping * np.diag(H) + 1e-12), -g)
+        step: Floats = np.asarray(np.linalg.solve(H + np.diag(damping * np.diag(H) + 1e-12), -g), float)
+        if not np.isfinite(step).all():
+            break
         moved = _apply(scene, step, edge_mm, refine_lens)
         trial = system(moved)
         if trial[2] < cost:
@@ -215,8 +217,8 @@ def _normal_equations(
         axis=1,
     )
     flat = columns[:, :, None] * n + columns[:, None, :]
-    H = np.bincount(flat.ravel(), blocks.ravel(), n * n).reshape(n, n)
-    g = np.bincount(columns.ravel(), gradient.ravel(), n)
+    H = np.asarray(np.bincount(flat.ravel(), blocks.ravel(), n * n), float).reshape(n, n)
+    g = np.asarray(np.bincount(columns.ravel(), gradient.ravel(), n), float)
     deviation = np.array(
         [
             np.log(lens.focal_px / prior_focal),
@@ -291,30 +293,3 @@ def _apply(scene: MarkerScene, step: Floats, edge_mm: float, refine_lens: bool) 
 def corners_of(squares: tuple[Pose, ...], edge_mm: float) -> Floats:
     """World corners (Q, 4, 3) mm of square markers with poses ``world_from_marker``."""
     return np.stack([s.apply(square_corners(edge_mm)) for s in squares])
-
-
-def corner_covariance(scene: MarkerScene, info: SolveInfo) -> Floats:
-    """Marginal covariance (12 Q, 12 Q) mm^2 of all corners, in the frame that the corners themselves define.
-
-    The choice of frame is removed by projecting the rigid motions out of the corners (an S-transformation,
-    Baarda 1973), so that a variance is that of a corner's place within the layout.
-    """
-    Q = len(scene.corners)
-    start = LENS + 6 * len(scene.poses)
-    full = np.linalg.pinv(info.normal, rcond=1e-12, hermitian=True)
-    block = full[start:, start:]
-    if scene.squares is not None:
-        B = np.zeros((12 * Q, 6 * Q))
-        for q, square in enumerate(scene.squares):
-            arm = scene.corners[q] - square.t
-            for c in range(4):
-                row = 12 * q + 3 * c
-                B[row : row + 3, 6 * q : 6 * q + 6] = np.hstack([-skew(arm[c]), np.eye(3)])
-        block = B @ block @ B.T
-    points = scene.corners.reshape(-1, 3)
-    motions = np.concatenate(
-        [np.tile(np.eye(3), (len(points), 1, 1)), -skew(points - points.mean(0))], -1
-    ).reshape(-1, 6)
-    q_basis, _ = np.linalg.qr(motions)
-    keep = np.eye(12 * Q) - q_basis @ q_basis.T
-    return np.asarray(keep @ block @ keep)

@@ -21,7 +21,7 @@ def vertex_sigma(mesh: Mesh, maps: tuple[DepthMap, ...], poses: tuple[Pose, ...]
     """Standard deviation (V,) mm of the mesh along its normal, from how far the depth maps scatter about it."""
     count = np.zeros(len(mesh.vertices), np.int32)
     rows = max(1, len(maps))
-    scatter = np.full((rows, len(mesh.vertices)), np.nan, np.float32)
+    scatter = np.full((rows, len(mesh.vertices)), np.inf, np.float32)
     for k, depth_map in enumerate(maps):
         view = depth_map.view(poses[depth_map.photo])
         cam = view.cam_from_world.apply(mesh.vertices.astype(float))
@@ -38,7 +38,9 @@ def vertex_sigma(mesh: Mesh, maps: tuple[DepthMap, ...], poses: tuple[Pose, ...]
         count += good
     seen = count > 0
     sigma = np.full(len(mesh.vertices), UNSEEN_SIGMA_MM, np.float32)
-    spread = SIGMA_OF_MAD * np.nanmedian(scatter[:, seen], axis=0)
+    # Sorting puts the unseen (infinite) last, so that the median stands in the middle of the seen.
+    ordered = np.sort(scatter[:, seen], axis=0)
+    spread = SIGMA_OF_MAD * ordered[count[seen] // 2, np.arange(int(seen.sum()))]
     # Averaging n depths shrinks only the part of their error that is their own.
     share = SHARED_ERROR**2 + (1 - SHARED_ERROR**2) / count[seen]
     sigma[seen] = np.clip(spread * np.sqrt(share), 0.01, UNSEEN_SIGMA_MM)

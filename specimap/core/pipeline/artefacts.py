@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from specimap import __version__
 from specimap.core.acquisition import Refusal
@@ -26,13 +27,14 @@ DEPTH_STEPS = 65534
 
 @dataclass(frozen=True)
 class Stage1:
-    """Reconstruction with the corners it was made from, and the photos' names."""
+    """Reconstruction with the corners it was made from, the photos' names, and the posed photos in grey (H, W)."""
 
     reconstruction: Reconstruction
     corners: CornersInPhotos
     names: tuple[str, ...]
     refused: tuple[Refusal, ...]
     subject_mm: float | None
+    greys: tuple[NDArray[np.uint8], ...]
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,7 @@ def save_stage1(store: Store, key: str, stage: Stage1) -> None:
         "seen_marker": c.seen.marker,
         "seen_corners": c.seen.corners_px,
         "seen_sigma": c.seen.sigma_px,
+        "greys": np.stack(stage.greys),
     }
     maps_meta = []
     for k, m in enumerate(r.maps):
@@ -107,7 +110,7 @@ def save_stage1(store: Store, key: str, stage: Stage1) -> None:
         step = max((float(m.depth.max()) - low) / DEPTH_STEPS, 1e-9)
         packed = np.where(known, np.round((m.depth - low) / step) + 1, 0).astype(np.uint16)
         arrays |= {f"depth_{k}": packed, f"colour_{k}": m.colour, f"turn_{k}": m.turn}
-        arrays[f"weight_{k}"] = (m.weight * 255).astype(np.uint8)
+        arrays[f"confidence_{k}"] = m.confidence
         maps_meta.append({"photo": m.photo, "low": low, "step": step, "lens": asdict(m.intrinsics)})
     meta = {
         "photos": r.photos, "lens": asdict(r.lens), "maps": maps_meta, "names": stage.names,
@@ -127,9 +130,11 @@ def load_stage1(store: Store, key: str) -> Stage1 | None:
     for k, m in enumerate(meta["maps"]):
         packed = arrays[f"depth_{k}"]
         depth = np.where(packed > 0, (packed.astype(np.float32) - 1) * m["step"] + m["low"], 0).astype(np.float32)
-        weight = arrays[f"weight_{k}"].astype(np.float32) / 255
+        lens = Intrinsics(**m["lens"])
         maps.append(
-            DepthMap(m["photo"], arrays[f"turn_{k}"], Intrinsics(**m["lens"]), depth, weight, arrays[f"colour_{k}"])
+            DepthMap(
+                m["photo"], arrays[f"turn_{k}"], lens, depth, arrays[f"confidence_{k}"], arrays[f"colour_{k}"]
+            )
         )
     reconstruction = Reconstruction(
         tuple(meta["photos"]), Intrinsics(**meta["lens"]), _unposes(arrays["poses"]), tuple(maps), arrays["points"],
@@ -141,6 +146,7 @@ def load_stage1(store: Store, key: str) -> Stage1 | None:
     return Stage1(
         reconstruction, CornersInPhotos(seen, tuple(meta["marker_ids"])), tuple(meta["names"]),
         tuple(Refusal(**x) for x in meta["refused"]), meta["subject_mm"],
+        tuple(arrays["greys"]),
     )  # fmt: skip
 
 

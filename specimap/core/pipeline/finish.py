@@ -21,7 +21,8 @@ from specimap.core.geometry import Floats, Pose, View
 from specimap.core.layout import edge_lengths
 from specimap.core.meshfile import write_mesh_ply
 from specimap.core.pipeline.artefacts import Stage1, Stage2
-from specimap.core.pipeline.run import Clock, Outputs, all_refused
+from specimap.core.pipeline.outputs import Outputs, staged
+from specimap.core.pipeline.run import Clock, all_refused
 from specimap.core.pipeline.settings import PipelineSettings
 from specimap.core.points import cloud_points
 from specimap.core.preview import write_preview
@@ -52,7 +53,8 @@ from specimap.core.report import (
 GRID_MARGIN_MM = 4.0
 CUBE_CORNER_FLOOR_PX = 0.03
 SUBJECT_DISAGREES = 2.0
-PLAUSIBLE_DISTANCE_MM = (40.0, 4000.0)
+PLAUSIBLE_DISTANCE_MM = (50.0, 1200.0)
+"""A phone does not focus nearer; and nobody photographs a specimen between markers from farther."""
 
 
 def register_and_write(
@@ -141,20 +143,20 @@ def register_and_write(
             settings=settings.as_dict(),
             inputs=inputs,
         )
-        outputs.report.unlink(missing_ok=True)  # an old report must not stand beside new results
-        write_mesh_ply(outputs.mesh, mesh)
-        named = zip(adjusted.marker_ids, adjusted.corners, strict=True)
-        write_text(outputs.corners, json.dumps({str(i): np.round(c, 6).tolist() for i, c in named}, indent=1))
-        write_cloud(
-            outputs.cloud,
-            points,
-            cube,
-            {"report": report.model_dump(mode="json"), "settings": settings.as_dict(), "inputs": inputs},
-            progress=lambda share: progress(0.4 + 0.5 * share),
-        )
-        write_preview(Cloud.open(outputs.cloud), outputs.preview)
-    report = report.model_copy(update={"seconds": dict(clock.seconds)})
-    write_text(outputs.report, report.model_dump_json(indent=1))
+        with staged(outputs) as aside:
+            write_mesh_ply(aside.mesh, mesh)
+            named = zip(adjusted.marker_ids, adjusted.corners, strict=True)
+            write_text(aside.corners, json.dumps({str(i): np.round(c, 6).tolist() for i, c in named}, indent=1))
+            write_cloud(
+                aside.cloud,
+                points,
+                cube,
+                {"report": report.model_dump(mode="json"), "settings": settings.as_dict(), "inputs": inputs},
+                progress=lambda share: progress(0.4 + 0.5 * share),
+            )
+            write_preview(Cloud.open(aside.cloud), aside.preview)
+            report = report.model_copy(update={"seconds": clock.so_far()})
+            write_text(aside.report, report.model_dump_json(indent=1))
     return report
 
 

@@ -9,16 +9,15 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 
 from specimap.core.acquisition import Photo, Refusal, photo_paths, read_photos
 from specimap.core.adjust import adjust
-from specimap.core.cube import Cube, inspect, open_cube
-from specimap.core.errors import CancelledError, OutputExistsError
-from specimap.core.files import disk_errors
+from specimap.core.cube import inspect, open_cube
+from specimap.core.errors import CancelledError
 from specimap.core.pipeline.artefacts import (
     Stage1,
     Stage2,
@@ -29,64 +28,19 @@ from specimap.core.pipeline.artefacts import (
     save_stage1,
     save_stage2,
 )
+from specimap.core.pipeline.outputs import Inputs, Outputs, prepare_folder
 from specimap.core.pipeline.settings import PipelineSettings
 from specimap.core.reconstruct.backend import ReconstructionBackend, corners_in_photos, detect_in_photos
+from specimap.core.reconstruct.depth import volume_over
+from specimap.core.refine import pixel_footprint_mm, refine_mesh
 from specimap.core.report import Report
 from specimap.core.surface import fuse
 from specimap.core.uncertainty import vertex_sigma
 
 STAGES = ("reconstruct", "adjust", "render", "register")
-MARK = ".specimap"
-"""A file in every output folder; a folder with other files and without it is not written to."""
-
+VOXEL_PIXELS = 2.0
+"""Edge of a fusion voxel in photo pixels on the specimen: finer ones hold noise, coarser ones lose bumps."""
 Progress = Callable[[str, float], None]
-
-
-@dataclass(frozen=True)
-class Inputs:
-    """``photos``: a folder; ``cube``: a file; ``white`` and ``dark``: reference frames, where there are some."""
-
-    photos: Path
-    cube: Path
-    white: Path | None = None
-    dark: Path | None = None
-
-
-@dataclass(frozen=True)
-class Outputs:
-    """Where a run's results lie."""
-
-    folder: Path
-
-    @property
-    def cloud(self) -> Path:
-        """The spectral cloud."""
-        return self.folder / "cloud.zarr"
-
-    @property
-    def mesh(self) -> Path:
-        """The surface."""
-        return self.folder / "mesh.ply"
-
-    @property
-    def report(self) -> Path:
-        """The report; written last, so that its presence says that the run is whole."""
-        return self.folder / "report.json"
-
-    @property
-    def corners(self) -> Path:
-        """The markers' corners."""
-        return self.folder / "corners.json"
-
-    @property
-    def preview(self) -> Path:
-        """Principal components on the top view."""
-        return self.folder / "preview.png"
-
-    @property
-    def store(self) -> Store:
-        """The stages' artefacts."""
-        return Store(self.folder / "stages")
 
 
 class Clock:
@@ -97,6 +51,7 @@ class Clock:
         self.reused: list[str] = []
         self._progress = progress
         self._cancelled = cancelled
+        self._running = STAGES[0], time.perf_counter()
 
     def report(self, stage: str, share: float) -> None:
         """Say how far a stage is.
@@ -110,34 +65,19 @@ class Clock:
             )
         self._progress(stage, min(max(share, 0.0), 1.0))
 
+    def so_far(self) -> dict[str, float]:
+        """Seconds of the finished stages and of the one that runs."""
+        name, start = self._running
+        return {**self.seconds, name: round(time.perf_counter() - start, 3)}
+
     @contextmanager
     def stage(self, name: str) -> Iterator[Callable[[float], None]]:
         """Time a stage; yields its progress function."""
-        start = time.perf_counter()
+        self._running = name, time.perf_counter()
         self.report(name, 0.0)
         yield lambda share: self.report(name, share)
-        self.seconds[name] = round(time.perf_counter() - start, 3)
+        self.seconds = self.so_far()
         self.report(name, 1.0)
-
-
-def prepare_folder(folder: Path) -> None:
-    """Make the output folder, or accept one of an earlier run.
-
-    Raises:
-        OutputExistsError: it holds files that Specimap did not write.
-        OutputNotWritableError: it cannot be made or written.
-    """
-    with disk_errors(folder):
-        if folder.exists() and not folder.is_dir():
-            raise OutputExistsError(f"{folder} is a file.", advice="Name a folder for the results.")
-        folder.mkdir(parents=True, exist_ok=True)
-        mark = folder / MARK
-        if not mark.exists() and any(folder.iterdir()):
-            raise OutputExistsError(
-                f"{folder} holds files that Specimap did not write.",
-                advice="Name a new or empty folder, or one of an earlier run.",
-            )
-        mark.write_text("An output folder of Specimap.\n", encoding="utf-8")
 
 
 def run_pipeline(
@@ -176,9 +116,11 @@ def run_pipeline(
         )
         stage1 = _reconstruct(paths, settings, outputs.store, key1, clock, workers)
         key2 = key_of(
-            "adjust", {"before": key1, "s": asdict(settings.adjust), "surface": asdict(settings.surface)}
-        )
-        stage2 = _adjust(stage1, settings, outputs.store, key2, clock)
+            "adjust",
+            {"before": key1, "s": asdict(settings.adjust), "surface": asdict(settings.surface),
+             "refine": asdict(settings.refine)},
+        )  # fmt: skip
+        stage2 = _adjust(stage1, settings, outputs.store, key2, clock, workers)
         key4 = key_of(
             "register",
             {"before": key2, "cube": fingerprint.result(), "render": asdict(settings.render),
@@ -188,7 +130,7 @@ def run_pipeline(
         if done is not None:
             for name in ("render", "register"):
                 clock.report(name, 1.0)
-            return done
+            return done.model_copy(update={"reused_stages": list(STAGES)})
         return register_and_write(
             stage1, stage2, cube, settings, outputs, clock, remarks,
             {"key": key4, "cube": fingerprint.result(), "photos": _together(digests)},
@@ -203,8 +145,11 @@ def backend_named(name: str) -> ReconstructionBackend:
 
 
 def _digest(path: Path) -> str:
-    with open(path, "rb") as f:
-        return hashlib.file_digest(f, "sha256").hexdigest()
+    try:
+        with open(path, "rb") as f:
+            return hashlib.file_digest(f, "sha256").hexdigest()
+    except OSError:
+        return "unreadable"  # refused by name when the photos are read
 
 
 def _together(digests: dict[str, str]) -> str:
@@ -245,8 +190,9 @@ def _reconstruct(
             progress=lambda s: progress(0.2 + 0.8 * s),
         )
         stage = Stage1(
-            reconstruction, corners, tuple(p.name for p in photos), tuple(refused), _subject_mm(photos)
-        )
+            reconstruction, corners, tuple(p.name for p in photos), tuple(refused), _subject_mm(photos),
+            tuple(photos[p].grey for p in reconstruction.photos),
+        )  # fmt: skip
         save_stage1(store, key, stage)
         return stage
 
@@ -256,7 +202,9 @@ def _subject_mm(photos: list[Photo]) -> float | None:
     return float(np.median(stated)) if stated else None
 
 
-def _adjust(stage1: Stage1, settings: PipelineSettings, store: Store, key: str, clock: Clock) -> Stage2:
+def _adjust(
+    stage1: Stage1, settings: PipelineSettings, store: Store, key: str, clock: Clock, workers: int
+) -> Stage2:
     with clock.stage("adjust") as progress:
         found = load_stage2(store, key)
         if found is not None:
@@ -269,7 +217,17 @@ def _adjust(stage1: Stage1, settings: PipelineSettings, store: Store, key: str, 
         posed = replace(posed, photo=np.array([place[int(p)] for p in posed.photo]))
         adjusted = adjust(r.lens, r.poses, posed, stage1.corners.marker_ids, settings.adjust)
         maps = tuple(replace(m, depth=m.depth * np.float32(adjusted.scale)) for m in r.maps)
-        mesh = fuse(list(maps), adjusted.poses, settings.surface, progress=lambda s: progress(0.05 + 0.85 * s))
+        target = volume_over(adjusted.corners).centre
+        voxel_mm = settings.surface.voxel_mm or VOXEL_PIXELS * pixel_footprint_mm(
+            adjusted.lens, adjusted.poses, target
+        )
+        fused = fuse(
+            list(maps), adjusted.poses, voxel_mm, settings.surface, progress=lambda s: progress(0.05 + 0.4 * s)
+        )
+        mesh = refine_mesh(
+            fused, list(stage1.greys), adjusted.lens, adjusted.poses, voxel_mm, settings.refine,
+            workers=workers, progress=lambda s: progress(0.45 + 0.5 * s),
+        )  # fmt: skip
         stage = Stage2(adjusted, mesh, vertex_sigma(mesh, maps, adjusted.poses).astype(float))
         save_stage2(store, key, stage)
         return stage
@@ -280,4 +238,4 @@ def all_refused(stage1: Stage1) -> list[Refusal]:
     return [*stage1.refused, *stage1.reconstruction.refused]
 
 
-__all__ = ["Clock", "Cube", "Inputs", "Outputs", "all_refused", "prepare_folder", "run_pipeline"]
+__all__ = ["Clock", "Inputs", "Outputs", "all_refused", "run_pipeline"]

@@ -9,6 +9,7 @@ from specimap.core.adjust import AdjustSettings
 from specimap.core.errors import SettingsError
 from specimap.core.fiducials import dictionary_named
 from specimap.core.reconstruct.backend import ReconstructSettings
+from specimap.core.refine import RefineSettings
 from specimap.core.register.register import RegisterSettings
 from specimap.core.render import RenderSettings
 from specimap.core.surface import SurfaceSettings
@@ -24,6 +25,7 @@ class PipelineSettings:
     reconstruct: ReconstructSettings = field(default_factory=ReconstructSettings)
     adjust: AdjustSettings = field(default_factory=AdjustSettings)
     surface: SurfaceSettings = field(default_factory=SurfaceSettings)
+    refine: RefineSettings = field(default_factory=RefineSettings)
     render: RenderSettings = field(default_factory=RenderSettings)
     register: RegisterSettings = field(default_factory=RegisterSettings)
 
@@ -40,7 +42,7 @@ class PipelineSettings:
             "r_reg": self.render.r_reg_mm,
             "r_pc": self.render.r_pc_mm,
             "working_px": self.acquisition.working_px,
-            "voxel_mm": self.surface.voxel_mm,
+            "voxel_mm": self.surface.voxel_mm or 1.0,
         }
         for name, value in positive.items():
             if not 0 < value < 1e6:

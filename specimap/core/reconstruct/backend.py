@@ -19,6 +19,11 @@ from specimap.core.solver import Observations
 CORNER_FLOOR_PX = 0.05
 """Least standard deviation of a corner: what neighbouring profiles share does not show in their scatter."""
 
+DICTIONARY_SAMPLE = 4
+"""Photos that other dictionaries are tried on."""
+DICTIONARY_FACTOR = 3
+"""Another dictionary must read this many times more markers than the given one."""
+
 Progress = Callable[[float], None]
 
 
@@ -109,8 +114,14 @@ def corners_in_photos(
         )
     shared = {i for i, n in shown.items() if n - twice[i] >= 2}
     rows = [(photo, d) for photo, d in rows if d.marker_id in shared]
+    if len(rows) < len(photos):
+        _refuse_other_dictionary(photos, rows, dictionary)
     if not rows:
-        _refuse_without_markers(photos, dictionary)
+        raise NoMarkersFoundError(
+            f"No marker of {dictionary} shows in two of the photos.",
+            advice="Place the printed markers around the specimen, flat and wholly in view, and photograph again.",
+            dictionary=dictionary,
+        )
     ids_used = tuple(sorted({d.marker_id for _, d in rows}))
     index = {marker_id: k for k, marker_id in enumerate(ids_used)}
     seen = Observations(
@@ -122,22 +133,20 @@ def corners_in_photos(
     return CornersInPhotos(seen, ids_used)
 
 
-def _refuse_without_markers(photos: list[Photo], dictionary: str) -> None:
-    few = [p.grey for p in photos[:: max(1, len(photos) // 3)]][:3]
-    fitting = fitting_dictionaries(few)
-    fitting.pop(dictionary, None)
-    if fitting:
-        best = next(iter(fitting))
-        raise WrongDictionaryError(
-            f"No marker of {dictionary} shows in the photos, but markers of {best} do.",
-            advice=f"Run again with the dictionary {best}.",
-            dictionary=dictionary,
-            fitting=fitting,
-        )
-    raise NoMarkersFoundError(
-        f"No marker of {dictionary} shows in two of the photos.",
-        advice="Place the four printed markers around the specimen, flat and wholly in view, and photograph again.",
+def _refuse_other_dictionary(photos: list[Photo], rows: list[tuple[int, Detection]], dictionary: str) -> None:
+    """Where few markers show: does another dictionary read far more? A wrong one reads a false marker now and then."""
+    few = range(0, len(photos), max(1, len(photos) // DICTIONARY_SAMPLE))
+    fitting = fitting_dictionaries([photos[p].grey for p in few])
+    own = sum(photo in few for photo, _ in rows)
+    fitting = {name: seen for name, seen in fitting.items() if seen > DICTIONARY_FACTOR * own}
+    if not fitting:
+        return
+    best = next(iter(fitting))
+    raise WrongDictionaryError(
+        f"{len(rows) or 'No'} markers of {dictionary} show in the photos, but many of {best} do.",
+        advice=f"Run again with the dictionary {best}, or a smaller one of its family.",
         dictionary=dictionary,
+        fitting=fitting,
     )
 
 

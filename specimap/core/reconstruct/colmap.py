@@ -49,13 +49,7 @@ class ColmapBackend:
             edge_mm=settings.edge_mm,
             focal_px=float(np.median(focal)) if len(focal) > len(photos) / 2 else None,
         )
-        if len(solution.foreign) >= max(3, FOREIGN_SHARE * len(photos)):
-            names = [photos[p].name for p in sorted(solution.foreign)]
-            raise PhotosNotConnectedError(
-                f"{len(names)} photos show the markers at other places than the rest: two scenes are mixed.",
-                advice="Give the photos of one unmoved scene; remove those named.",
-                photos=names,
-            )
+        _refuse_two_scenes(photos, solution)
         frame = marker_frame(
             solution.scene.corners, np.stack([p.centre for p in solution.scene.poses])
         )
@@ -90,6 +84,24 @@ class ColmapBackend:
         )  # fmt: skip
 
 
+def _refuse_two_scenes(photos: list[Photo], solution: MarkerSolution) -> None:
+    """A few foreign photos are left out later; many are a second scene, and which one is meant is not ours to say."""
+    strange = sorted([*solution.foreign, *solution.unconnected])
+    if len(strange) < max(3, FOREIGN_SHARE * len(photos)):
+        return
+    names = [photos[p].name for p in strange]
+    how = (
+        "show the markers at other places than the rest"
+        if len(solution.foreign) >= len(solution.unconnected)
+        else "show no marker that the rest shows"
+    )
+    raise PhotosNotConnectedError(
+        f"{len(names)} of {len(photos)} photos {how}: two scenes are mixed.",
+        advice="Give the photos of one unmoved scene; the details name those that stand apart.",
+        photos=names,
+    )
+
+
 def _reach_the_rest(
     photos: list[Photo],
     solution: MarkerSolution,
@@ -102,9 +114,13 @@ def _reach_the_rest(
     refused = [
         Refusal(photos[p].name, "photo_foreign", f"Its markers stand {rms:.0f} px from where the others show them.")
         for p, rms in solution.foreign.items()
+    ] + [
+        Refusal(photos[p].name, "photo_foreign", "It shows markers, but none that the other photos show.")
+        for p in solution.unconnected
     ]
+    strange = {*solution.foreign, *solution.unconnected}
     sure = {p: pose for p, pose in poses.items() if p not in weak}
-    open_photos = [p for p in range(len(photos)) if p not in sure and p not in solution.foreign]
+    open_photos = [p for p in range(len(photos)) if p not in sure and p not in strange]
     if not open_photos:
         return sure, refused
     if len(sure) < 2:
@@ -116,7 +132,8 @@ def _reach_the_rest(
     while waiting and moved:
         moved = False
         for photo in list(waiting):
-            located = locator.locate(photo)
+            among = locator.near((poses[photo], weak[photo])) if photo in weak else None
+            located = locator.locate(photo, among)
             if located is None:
                 continue
             pose = located.pose
@@ -140,7 +157,9 @@ def _why(photo: Photo, weak: bool, blurred: bool) -> Refusal:
         return Refusal(
             photo.name, "photo_ambiguous", "Its single marker leaves two poses, and its features decide neither."
         )
-    return Refusal(photo.name, "photo_unlocated", "It shows no marker, and its features match no other photo.")
+    return Refusal(
+        photo.name, "photo_unlocated", "It shows no marker that others show, and its features match no other photo."
+    )
 
 
 def _angle_deg(a: Pose, b: Pose) -> float:

@@ -22,6 +22,8 @@ RATIO = 0.8
 MOST_FEATURES = 2000
 TRIANGULATION_PX = 2.0
 RESECTION_PX = 4.0
+NEAREST = 4
+"""Photos that a photo with a rough pose is compared with, for each such pose."""
 LEAST_INLIERS = 15
 LEAST_INLIER_SHARE = 0.2
 
@@ -120,7 +122,6 @@ class Locator:
         self._features: dict[int, Features] = {}
         self._places: dict[int, Floats] = {}  # photo -> (N, 3), NaN where a feature has no place
         self.poses = dict(poses)
-        self._place(tuple(sorted(poses)))
 
     def _ready(self, photos: Iterable[int]) -> None:
         missing = [p for p in photos if p not in self._features]
@@ -128,15 +129,23 @@ class Locator:
             found = pool.map(extract, [self._photos[p] for p in missing])
             self._features.update(zip(missing, found, strict=True))
 
-    def _place(self, photos: tuple[int, ...]) -> None:
-        """Triangulate features between neighbours."""
-        self._ready(photos)
-        for p in photos:
-            self._places.setdefault(p, np.full((len(self._features[p].xy), 3), np.nan))
-        settings = DepthSettings(pairs_per_photo=2)
-        poses = tuple(self.poses[p] for p in photos)
-        for i, j in choose_pairs(poses, self._target, settings):
-            self._triangulate(photos[i], photos[j])
+    def _place(self, photos: Iterable[int]) -> None:
+        """Triangulate the features of posed photos with their neighbours, once."""
+        order = tuple(sorted(self.poses))
+        poses = tuple(self.poses[p] for p in order)
+        new = [p for p in photos if p not in self._places]
+        if not new:
+            return
+        pairs = [
+            (order[i], order[j])
+            for i, j in choose_pairs(poses, self._target, DepthSettings(pairs_per_photo=2))
+            if order[i] in new
+        ]
+        self._ready({p for pair in pairs for p in pair} | set(new))
+        for p in new:
+            self._places[p] = np.full((len(self._features[p].xy), 3), np.nan)
+        for a, b in pairs:
+            self._triangulate(a, b)
 
     def _triangulate(self, a: int, b: int) -> None:
         pairs = match(self._features[a], self._features[b])
@@ -145,16 +154,28 @@ class Locator:
         xy = self._features[a].xy[pairs[:, 0]], self._features[b].xy[pairs[:, 1]]
         points, good = triangulate_pair(self._lens, (self.poses[a], self.poses[b]), xy)
         self._places[a][pairs[good, 0]] = points[good]
-        self._places[b][pairs[good, 1]] = points[good]
+        if b in self._places:
+            self._places[b][pairs[good, 1]] = points[good]
 
-    def locate(self, photo: int) -> Located | None:
-        """Resect a photo; None where too few matches agree."""
+    def near(self, poses: Iterable[Pose]) -> set[int]:
+        """The posed photos that look from about where a photo with one of ``poses`` would."""
+        known = np.array(sorted(self.poses))
+        sights = np.stack([self._sight(self.poses[int(p)]) for p in known])
+        return {int(p) for pose in poses for p in known[np.argsort(-(sights @ self._sight(pose)))[:NEAREST]]}
+
+    def _sight(self, pose: Pose) -> Floats:
+        away = pose.centre - self._target
+        return np.asarray(away / np.linalg.norm(away))
+
+    def locate(self, photo: int, among: set[int] | None = None) -> Located | None:
+        """Resect a photo against the posed photos ``among``, all by default; None where too few matches agree."""
+        others = set(self.poses) - {photo} if among is None else among - {photo}
+        self._place(others)
         self._ready([photo])
         mine = self._features[photo]
         xy, places = [np.zeros((0, 2))], [np.zeros((0, 3))]
-        for other, known in self._places.items():
-            if other == photo:
-                continue
+        for other in sorted(others):
+            known = self._places[other]
             pairs = match(mine, self._features[other])
             at = known[pairs[:, 1]]
             placed = np.isfinite(at).all(1)
@@ -181,11 +202,3 @@ class Locator:
     def add(self, photo: int, pose: Pose) -> None:
         """Count a photo as posed; its features take part from now on."""
         self.poses[photo] = pose
-        self._ready([photo])
-        self._places[photo] = np.full((len(self._features[photo].xy), 3), np.nan)
-        photos = tuple(sorted(self.poses))
-        poses = tuple(self.poses[p] for p in photos)
-        mine = photos.index(photo)
-        for i, j in choose_pairs(poses, self._target, DepthSettings(pairs_per_photo=2)):
-            if i == mine:
-                self._triangulate(photos[i], photos[j])

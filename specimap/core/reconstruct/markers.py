@@ -8,19 +8,29 @@ unknown: several starts, the lowest cost wins.
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
-from specimap.core.errors import MarkerGeometryError, PhotosNotConnectedError
-from specimap.core.geometry import Floats, Intrinsics, Pose, rotation_from_vector
-from specimap.core.solver import MarkerScene, Observations, SolveInfo, corners_of, solve, square_corners
+from specimap.core.errors import MarkerGeometryError
+from specimap.core.geometry import Intrinsics, Pose
+from specimap.core.reconstruct.squares import (
+    agreeing_poses,
+    largest_consensus,
+    medoid,
+    required,
+    square_poses,
+    two_poses,
+)
+from specimap.core.solver import MarkerScene, Observations, SolveInfo, corners_of, solve
 
 FOCAL_STARTS = (0.8, 1.2, 1.8)
 """Starts for an unknown focal length, in longer sides of the photo (measured: one start in three fails)."""
 OUTLIER_PX = 6.0
 """Floor of the distance at which a marker in a photo is called foreign to the rest."""
+
+LEAST_AGREEING = 3
+"""Photos that must share one layout of markers."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +49,7 @@ class MarkerSolution:
     markers: tuple[int, ...]
     weak: dict[int, Pose]
     foreign: dict[int, float]
+    unconnected: tuple[int, ...]
 
 
 def solve_from_markers(
@@ -57,18 +68,17 @@ def solve_from_markers(
         focal_px: from EXIF, where there is one; used as a start and a weak prior.
 
     Raises:
-        PhotosNotConnectedError: photos fall into groups that share no marker.
         MarkerGeometryError: no start leads to a consistent set of cameras.
     """
     longer = max(size)
     starts = [focal_px] if focal_px else [s * longer for s in FOCAL_STARTS]
-    best: MarkerSolution | None = None
-    for start in starts:
-        solution = _solve_start(seen, marker_ids, Intrinsics.centred(*size, start), edge_mm, focal_px)
-        if best is None or _rank(solution) < _rank(best):
-            best = solution
-    assert best is not None
+    lenses = [Intrinsics.centred(*size, start) for start in starts]
     limit = max(OUTLIER_PX, 0.004 * longer)
+    best = min((_solve_start(seen, marker_ids, lens, edge_mm, focal_px) for lens in lenses), key=_rank)
+    if best.info.rms_after_px > limit or best.foreign:
+        # A layout averaged over two scenes fits neither: find the one that most photos share.
+        agreed = [_solve_agreed(seen, marker_ids, lens, edge_mm, focal_px, limit) for lens in lenses]
+        best = min([best, *(s for s in agreed if s)], key=lambda s: (s.info.rms_after_px > limit, _rank(s)))
     if best.info.rms_after_px > 2 * limit:
         raise MarkerGeometryError(
             f"The markers do not fit together: {best.info.rms_after_px:.1f} px remain.",
@@ -79,7 +89,25 @@ def solve_from_markers(
 
 
 def _rank(solution: MarkerSolution) -> tuple[int, float]:
-    return len(solution.foreign), solution.info.cost
+    return len(solution.foreign) + len(solution.unconnected), solution.info.cost
+
+
+def _solve_agreed(
+    seen: Observations,
+    marker_ids: tuple[int, ...],
+    lens: Intrinsics,
+    edge_mm: float,
+    focal_prior: float | None,
+    limit_px: float,
+) -> MarkerSolution | None:
+    """The solution from the photos that share one layout of markers; None where that leaves too few."""
+    picked = agreeing_poses(seen, two_poses(seen, lens, edge_mm))
+    contradict = largest_consensus(seen, picked, lens, edge_mm, limit_px)
+    keep = ~np.isin(seen.photo, list(contradict))
+    if not contradict or len(np.unique(seen.photo[keep])) < LEAST_AGREEING:
+        return None
+    solution = _solve_start(seen.of(keep), marker_ids, lens, edge_mm, focal_prior)
+    return replace(solution, foreign={**contradict, **solution.foreign})
 
 
 def _solve_start(
@@ -89,9 +117,9 @@ def _solve_start(
     edge_mm: float,
     focal_prior: float | None,
 ) -> MarkerSolution:
-    choices = _two_poses(seen, lens, edge_mm)
-    picked = _agreeing(seen, choices)
-    poses, squares = _chain(seen, picked, len(marker_ids))
+    picked = agreeing_poses(seen, two_poses(seen, lens, edge_mm))
+    poses, squares, lost = _chain(seen, picked, len(marker_ids))
+    seen = seen.of(np.isin(seen.photo, list(poses)))
     photos, markers = tuple(sorted(poses)), tuple(sorted(squares))
     inner = _reindexed(seen, photos, markers)
     world = tuple(squares[m] for m in markers)
@@ -112,15 +140,14 @@ def _solve_start(
         if np.median(own) > limit:
             foreign[photos[k]] = float(np.median(own))
     keep = np.array([photos[p] not in foreign for p in inner.photo]) & (residual <= limit)
+    weak = {photos[p]: pose for p, pose in weak.items()}
     if foreign or not keep.all():
         scene, info, inner, photos, markers = _without(
             scene, inner, keep, photos, markers, edge_mm, focal_prior
         )
     ids = tuple(marker_ids[m] for m in markers)
-    return MarkerSolution(
-        scene, info, inner, photos, ids, {photos[p]: pose for p, pose in weak.items() if p < len(photos)}
-        if not foreign else {}, foreign,
-    )  # fmt: skip
+    weak = {p: pose for p, pose in weak.items() if p in photos}
+    return MarkerSolution(scene, info, inner, photos, ids, weak, foreign, lost)
 
 
 def _without(
@@ -160,48 +187,13 @@ def _reindexed(seen: Observations, photos: tuple[int, ...], markers: tuple[int, 
     )
 
 
-def square_poses(corners_px: Floats, lens: Intrinsics, edge_mm: float) -> list[tuple[Pose, float]]:
-    """The two poses ``cam_from_marker`` of a square with corners (4, 2), with their RMS in pixels, best first."""
-    _, rvecs, tvecs, errors = cv2.solvePnPGeneric(
-        square_corners(edge_mm), corners_px.reshape(4, 1, 2), lens.matrix, lens.distortion,
-        flags=cv2.SOLVEPNP_IPPE_SQUARE,
-    )  # fmt: skip
-    found = [
-        (Pose(rotation_from_vector(r.ravel()), t.ravel()), float(e))
-        for r, t, e in zip(rvecs, tvecs, errors.ravel(), strict=True)
-        if np.isfinite(r).all() and np.isfinite(t).all()
-    ]
-    return sorted(found, key=lambda pair: pair[1])
-
-
-def _two_poses(seen: Observations, lens: Intrinsics, edge_mm: float) -> list[list[tuple[Pose, float]]]:
-    return [square_poses(c, lens, edge_mm) for c in seen.corners_px]
-
-
-def _agreeing(seen: Observations, choices: list[list[tuple[Pose, float]]]) -> list[Pose | None]:
-    """Per observation the pose whose normal the photo's other markers share; alone, the better fitting one."""
-    picked: list[Pose | None] = [None] * len(choices)
-    for photo in np.unique(seen.photo):
-        rows = np.flatnonzero(seen.photo == photo)
-        options = [(k, pose, e) for k in rows for pose, e in choices[k]]
-        if not options:
-            continue
-        normals = np.stack([pose.R[:, 2] for _, pose, _ in options])
-        owner = np.array([k for k, _, _ in options])
-        misfit = 1 - normals @ normals.T
-        totals = np.array([sum(misfit[i][owner == k].min() for k in set(owner)) for i in range(len(options))])
-        # One marker alone leaves a tie, which the fit decides.
-        leader = int(np.argmin(totals + 1e-3 * np.array([e for _, _, e in options])))
-        for k in set(owner):
-            mine = np.flatnonzero(owner == k)
-            picked[k] = options[mine[int(np.argmin(misfit[leader][mine]))]][1]
-    return picked
-
-
 def _chain(
     seen: Observations, picked: list[Pose | None], marker_count: int
-) -> tuple[dict[int, Pose], dict[int, Pose]]:
-    """Walk from the marker seen most over the photos to all others; averages are left to the least squares."""
+) -> tuple[dict[int, Pose], dict[int, Pose], tuple[int, ...]]:
+    """Walk from the marker seen most over the photos to all others; averages are left to the least squares.
+
+    Returns poses of photos, poses of markers, and the photos that the walk does not reach.
+    """
     by_photo: dict[int, list[int]] = defaultdict(list)
     for k, photo in enumerate(seen.photo):
         if picked[k] is not None:
@@ -219,34 +211,12 @@ def _chain(
             break
         _, _, photo = max(reachable)
         known = [k for k in by_photo[photo] if int(seen.marker[k]) in squares]
-        candidates = [_required(picked[k]) @ squares[int(seen.marker[k])].inverse() for k in known]
-        pose = _medoid(candidates)
+        candidates = [required(picked[k]) @ squares[int(seen.marker[k])].inverse() for k in known]
+        pose = medoid(candidates)
         poses[photo] = pose
         for k in by_photo[photo]:
-            squares.setdefault(int(seen.marker[k]), pose.inverse() @ _required(picked[k]))
-    lost = sorted(set(by_photo) - set(poses))
-    if lost:
-        raise PhotosNotConnectedError(
-            f"{len(lost)} of {len(by_photo)} photos show no marker that the others show: they are of another scene.",
-            advice="Remove the foreign photos, or take photos that show markers of both groups.",
-            photos=lost,
-        )
-    return poses, squares
-
-
-def _required(pose: Pose | None) -> Pose:
-    assert pose is not None
-    return pose
-
-
-def _medoid(candidates: list[Pose]) -> Pose:
-    centres = np.stack([c.centre for c in candidates])
-    turns = np.stack([c.R for c in candidates])
-    far = np.linalg.norm(centres[:, None] - centres[None], axis=-1) / (
-        1e-9 + np.linalg.norm(centres, axis=-1).mean()
-    )
-    cosine = (np.einsum("aij,bij->ab", turns, turns) - 1) / 2
-    return candidates[int((far + 1 - cosine).sum(1).argmin())]
+            squares.setdefault(int(seen.marker[k]), pose.inverse() @ required(picked[k]))
+    return poses, squares, tuple(sorted(set(by_photo) - set(poses)))
 
 
 def _unflip(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from specimap.core.errors import DuplicateMarkersError, MarkersMissingInCubeError
 from specimap.core.fiducials import Detection, detect_markers
-from specimap.core.geometry import Floats
+from specimap.core.geometry import Array, Floats
 
 LEAST_MARKERS = 2
 WINDOWS = 6
@@ -21,13 +22,27 @@ WINDOWS = 6
 class Bands(Protocol):
     """What the search needs of a cube."""
 
-    rows: int
-    cols: int
-    bands: int
-    wavelengths_nm: Floats
-    bad_bands: NDArray[np.bool_]
+    @property
+    def cols(self) -> int:
+        """Columns."""
+        ...
 
-    def band(self, index: int) -> NDArray[np.generic]:
+    @property
+    def bands(self) -> int:
+        """Bands."""
+        ...
+
+    @property
+    def wavelengths_nm(self) -> Floats:
+        """(bands,), NaN where unknown."""
+        ...
+
+    @property
+    def bad_bands(self) -> NDArray[np.bool_]:
+        """(bands,)."""
+        ...
+
+    def band(self, index: int) -> Array:
         """One band (rows, cols)."""
         ...
 
@@ -122,7 +137,7 @@ def find_markers(cube: Bands, dictionary: str, known: tuple[int, ...]) -> CubeMa
     return CubeMarkers(tuple(ids), corners, np.array([d.sigma_px for d in found]), image, where, mirrored)
 
 
-def _candidates(cube: Bands, mean: NDArray[np.float32]):  # type: ignore[no-untyped-def]
+def _candidates(cube: Bands, mean: NDArray[np.float32]) -> Iterator[tuple[NDArray[np.float32], str]]:
     """The mean, then windows of the spectrum, then single bands, each with its name."""
     yield mean, "band mean"
     good = np.flatnonzero(~cube.bad_bands)

@@ -1,0 +1,206 @@
+"""Move a mesh to where the photos agree: each vertex along its normal, by photo-consistency among many views.
+
+Pairwise depth is fused at the resolution of its matching windows and leans inward on bumps. Here, patches lying in
+the surface's own tangent plane are compared among up to five photos at once (mean pairwise normalised
+cross-correlation, as in multi-view stereo since Goesele et al. 2007) for a few offsets along the normal; the best
+offset, to a fraction of the step, is smoothed over neighbours by how sharply it is determined.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+
+from specimap.core.geometry import Floats, Intrinsics, Pose
+from specimap.core.raycast import RayCaster
+from specimap.core.surface import Mesh, vertex_normals
+
+CHUNK = 2048
+NOISE_VARIANCE = 4.0
+"""Variance in grey levels that a patch is given on top of its own, so that plain areas do not count as agreeing."""
+
+
+@dataclass(frozen=True)
+class RefineSettings:
+    """Photo-consistent refinement.
+
+    ``views``: photos compared at a vertex. ``half_samples``: the patch is (2 n + 1)^2 samples, a photo's pixel
+    apart on the surface. ``reach_voxels``: farthest offset. ``steps``: offsets tried. ``least_score``: correlation
+    below which a vertex follows its neighbours. ``smoothness``: weight of the neighbours.
+    """
+
+    views: int = 5
+    half_samples: int = 2
+    reach_voxels: float = 2.0
+    steps: int = 11
+    least_score: float = 0.3
+    smoothness: float = 0.2
+    smoothing_rounds: int = 10
+    least_cosine: float = 0.25
+
+
+def pixel_footprint_mm(lens: Intrinsics, poses: tuple[Pose, ...], target: Floats) -> float:
+    """Size of a photo's pixel at ``target`` (3,) mm, median over the photos."""
+    return float(np.median([np.linalg.norm(p.centre - target) for p in poses])) / lens.focal_px
+
+
+def refine_mesh(
+    mesh: Mesh,
+    images: list[NDArray[np.uint8]],
+    lens: Intrinsics,
+    poses: tuple[Pose, ...],
+    voxel_mm: float,
+    settings: RefineSettings,
+    *,
+    workers: int,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Mesh:
+    """The mesh with its vertices moved along their normals; ``images`` (H, W) grey, in the order of ``poses``."""
+    points, normals = mesh.vertices.astype(float), mesh.normals.astype(float)
+    views = choose_views(mesh, lens, poses, settings)
+    progress(0.2)
+    reach = settings.reach_voxels * voxel_mm
+    offsets = np.linspace(-reach, reach, settings.steps)
+    sample_mm = pixel_footprint_mm(lens, poses, points.mean(0))
+    greys = [image.astype(np.float32) for image in images]
+    scores = np.zeros((len(points), settings.steps), np.float32)
+
+    def run(part: slice) -> None:
+        scores[part] = _scores(
+            points[part], normals[part], views[part], greys, lens, poses, offsets, sample_mm, settings.half_samples
+        )
+
+    parts = [slice(k, k + CHUNK) for k in range(0, len(points), CHUNK)]
+    with ThreadPoolExecutor(workers) as pool:
+        for done, _ in enumerate(pool.map(run, parts), 1):
+            progress(0.2 + 0.7 * done / len(parts))
+    best, weight = _best_offsets(scores, offsets)
+    sure = ((views >= 0).sum(1) >= 3) & (scores.max(1) > settings.least_score)
+    weight = np.where(sure, weight, 0.0)
+    if not (weight > 0).any():
+        return mesh
+    weight = np.minimum(weight / np.median(weight[weight > 0]), 5.0)
+    moved = points + _smoothed(best, weight, mesh.triangles, settings)[:, None] * normals
+    vertices = moved.astype(np.float32)
+    return Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), mesh.colours)
+
+
+def choose_views(
+    mesh: Mesh, lens: Intrinsics, poses: tuple[Pose, ...], settings: RefineSettings
+) -> NDArray[np.int64]:
+    """For each vertex the photos that see it most squarely and unhidden, (V, views); -1 where there are fewer."""
+    points, normals = mesh.vertices.astype(float), mesh.normals.astype(float)
+    cosine = np.empty((len(poses), len(points)), np.float32)
+    margin = 6
+    for k, pose in enumerate(poses):
+        away = pose.centre - points
+        facing = (away * normals).sum(1) / np.linalg.norm(away, axis=1)
+        cam = pose.apply(points)
+        pixels = lens.project(cam)
+        inside = (
+            (cam[:, 2] > 0)
+            & (pixels > margin).all(1)
+            & (pixels < [lens.width - 1 - margin, lens.height - 1 - margin]).all(1)
+        )
+        cosine[k] = np.where(inside, facing, -1)
+    # A few more candidates than needed, since some will be hidden.
+    order = np.argsort(-cosine, axis=0)[: settings.views + 3]
+    seen = np.take_along_axis(cosine, order, 0) > settings.least_cosine
+    rank, vertex = np.nonzero(seen)
+    centres = np.stack([p.centre for p in poses])
+    away = centres[order[rank, vertex]] - points[vertex]
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    clearance = 0.4 * away + 0.15 * normals[vertex]
+    hidden = RayCaster(mesh).cast(points[vertex] + clearance, away).hit
+    seen[rank[hidden], vertex[hidden]] = False
+    place = np.cumsum(seen, axis=0)
+    seen &= place <= settings.views
+    chosen = np.full((len(points), settings.views), -1, np.int64)
+    rank, vertex = np.nonzero(seen)
+    chosen[vertex, place[rank, vertex] - 1] = order[rank, vertex]
+    return chosen
+
+
+def _scores(
+    points: Floats,
+    normals: Floats,
+    views: NDArray[np.int64],
+    greys: list[NDArray[np.float32]],
+    lens: Intrinsics,
+    poses: tuple[Pose, ...],
+    offsets: Floats,
+    sample_mm: float,
+    half: int,
+) -> NDArray[np.float32]:
+    """Mean pairwise correlation (m, steps) of the patches at the offsets."""
+    known = views >= 0
+    owner = np.where(known, views, 0)
+    R, t = np.stack([p.R for p in poses])[owner], np.stack([p.t for p in poses])[owner]
+    side = np.arange(-half, half + 1) * sample_mm
+    across, along = (g.ravel().astype(np.float32) for g in np.meshgrid(side, side))
+    helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    tangent = np.cross(helper, normals)
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
+    other = np.cross(normals, tangent)
+
+    def project(x: Floats) -> Floats:
+        return lens.project(np.einsum("mkij,mj->mki", R, x) + t)
+
+    # Over a millimetre the projection is linear to a thousandth of a pixel: its derivatives serve all samples.
+    small = 0.05
+    base = project(points).astype(np.float32)
+    by_normal = ((project(points + small * normals) - project(points - small * normals)) / (2 * small))
+    by_tangent = ((project(points + small * tangent) - base) / small).astype(np.float32)
+    by_other = ((project(points + small * other) - base) / small).astype(np.float32)
+    patch = by_tangent[:, :, None] * across[:, None] + by_other[:, :, None] * along[:, None]
+    rows_of_view = [(v, *np.nonzero(views == v)) for v in np.unique(views[known])]
+    count = known.sum(1)
+    pairs = np.maximum(count * (count - 1), 1)
+    floor = NOISE_VARIANCE * len(across) / 4
+    out = np.empty((len(points), len(offsets)), np.float32)
+    for k, offset in enumerate(offsets):
+        at = (base + np.float32(offset) * by_normal.astype(np.float32))[:, :, None] + patch
+        values = np.zeros(at.shape[:3], np.float32)
+        for view, row, column in rows_of_view:
+            where = at[row, column]
+            values[row, column] = cv2.remap(greys[view], where[..., 0], where[..., 1], cv2.INTER_LINEAR)
+        values -= values.mean(2, keepdims=True)
+        values /= np.sqrt((values**2).sum(2, keepdims=True) + floor)
+        values *= known[..., None]
+        together = (values.sum(1) ** 2).sum(1) - (values**2).sum((1, 2))
+        out[:, k] = together / pairs
+    return out
+
+
+def _best_offsets(scores: NDArray[np.float32], offsets: Floats) -> tuple[Floats, Floats]:
+    """Offset of the parabola's top (V,) and how sharp it is (V,); 0 sharp where the top is at the end."""
+    step = offsets[1] - offsets[0]
+    top = scores.argmax(1)
+    middle = np.clip(top, 1, len(offsets) - 2)
+    rows = np.arange(len(scores))
+    left, centre, right = (scores[rows, middle + d].astype(float) for d in (-1, 0, 1))
+    bend = left - 2 * centre + right
+    curved = bend < -1e-6
+    shift = np.clip(np.where(curved, 0.5 * (left - right) / np.where(curved, bend, -1.0), 0.0), -1, 1)
+    inner = curved & (top > 0) & (top < len(offsets) - 1)
+    return offsets[middle] + shift * step, np.where(inner, -bend * np.maximum(centre, 0), 0.0)
+
+
+def _smoothed(best: Floats, weight: Floats, triangles: NDArray[np.int32], settings: RefineSettings) -> Floats:
+    """Offsets (V,) that follow ``best`` by ``weight`` and their neighbours for the rest (Jacobi rounds)."""
+    n = len(best)
+    a, b = triangles[:, [0, 1, 2]].ravel(), triangles[:, [1, 2, 0]].ravel()
+    edges = coo_array((np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, a])), shape=(n, n)).tocsr()
+    edges.data[:] = 1.0
+    degree = np.asarray(edges.sum(1)).ravel()
+    out = np.where(weight > 0, best, 0.0)
+    for _ in range(settings.smoothing_rounds):
+        pull = settings.smoothness * (edges @ out)
+        out = (weight * best + pull) / (weight + settings.smoothness * degree + 1e-12)
+    return np.asarray(out)
