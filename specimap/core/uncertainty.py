@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,27 +17,22 @@ AGREEMENT_MM = 1.5
 SHARED_ERROR = 0.5
 """Part of a single depth's error that neighbouring pairs share, and that averaging therefore leaves."""
 UNSEEN_SIGMA_MM = 1.0
+LEAST_COSINE = 0.15
+"""A surface seen more obliquely than this tells little about its height."""
 
 
-def vertex_sigma(mesh: Mesh, maps: tuple[DepthMap, ...], poses: tuple[Pose, ...]) -> NDArray[np.float32]:
+def vertex_sigma(
+    mesh: Mesh, maps: tuple[DepthMap, ...], poses: tuple[Pose, ...], *, workers: int = 1
+) -> NDArray[np.float32]:
     """Standard deviation (V,) mm of the mesh along its normal, from how far the depth maps scatter about it."""
-    count = np.zeros(len(mesh.vertices), np.int32)
-    rows = max(1, len(maps))
-    scatter = np.full((rows, len(mesh.vertices)), np.inf, np.float32)
-    for k, depth_map in enumerate(maps):
-        view = depth_map.view(poses[depth_map.photo])
-        cam = view.cam_from_world.apply(mesh.vertices.astype(float))
-        height, width = depth_map.depth.shape
-        pixels = np.round(view.intrinsics.project(cam)).astype(np.int64)
-        inside = ((pixels >= 0) & (pixels < [width, height])).all(1) & (cam[:, 2] > 0)
-        depth = np.zeros(len(cam), np.float32)
-        depth[inside] = depth_map.depth[pixels[inside, 1], pixels[inside, 0]]
-        sight = view.cam_from_world.centre - mesh.vertices
-        cosine = (sight * mesh.normals).sum(1) / np.linalg.norm(sight, axis=1)
-        off = (depth - cam[:, 2]) * cosine
-        good = (depth > 0) & (cosine > 0.15) & (np.abs(off) < AGREEMENT_MM)
-        scatter[k, good] = np.abs(off[good])
-        count += good
+    scatter = np.full((max(1, len(maps)), len(mesh.vertices)), np.inf, np.float32)
+
+    def measure(k: int) -> None:
+        scatter[k] = _distance_along_normals(mesh, maps[k], poses[maps[k].photo])
+
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(measure, range(len(maps))))
+    count = np.isfinite(scatter).sum(0)
     seen = count > 0
     sigma = np.full(len(mesh.vertices), UNSEEN_SIGMA_MM, np.float32)
     # Sorting puts the unseen (infinite) last, so that the median stands in the middle of the seen.
@@ -45,6 +42,28 @@ def vertex_sigma(mesh: Mesh, maps: tuple[DepthMap, ...], poses: tuple[Pose, ...]
     share = SHARED_ERROR**2 + (1 - SHARED_ERROR**2) / count[seen]
     sigma[seen] = np.clip(spread * np.sqrt(share), 0.01, UNSEEN_SIGMA_MM)
     return sigma
+
+
+def _distance_along_normals(mesh: Mesh, depth_map: DepthMap, pose: Pose) -> NDArray[np.float32]:
+    """Distance (V,) mm of a depth map from the mesh along the normals; infinite where it does not see it."""
+    view = depth_map.view(pose)
+    lens = view.intrinsics
+    centre = view.cam_from_world.centre.astype(np.float32)
+    sight = centre - mesh.vertices
+    cam = -sight @ view.cam_from_world.R.T.astype(np.float32)
+    z = np.maximum(cam[:, 2], 1e-3)
+    column = np.rint(cam[:, 0] * np.float32(lens.focal_px) / z + np.float32(lens.cx)).astype(np.int32)
+    row = np.rint(cam[:, 1] * np.float32(lens.focal_px) / z + np.float32(lens.cy)).astype(np.int32)
+    height, width = depth_map.depth.shape
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    at = np.flatnonzero(inside)
+    depth = depth_map.depth[row[at], column[at]]
+    cosine = (sight[at] * mesh.normals[at]).sum(1) / np.linalg.norm(sight[at], axis=1)
+    off = np.abs(depth - cam[at, 2]) * cosine
+    good = (depth > 0) & (cosine > LEAST_COSINE) & (off < AGREEMENT_MM)
+    out = np.full(len(mesh.vertices), np.inf, np.float32)
+    out[at[good]] = off[good]
+    return out
 
 
 def point_sigma(

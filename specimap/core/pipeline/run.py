@@ -228,7 +228,7 @@ def _adjust(
             fused, list(stage1.greys), adjusted.lens, adjusted.poses, voxel_mm, settings.refine,
             workers=workers, progress=lambda s: progress(0.45 + 0.5 * s),
         )  # fmt: skip
-        stage = Stage2(adjusted, mesh, vertex_sigma(mesh, maps, adjusted.poses).astype(float))
+        stage = Stage2(adjusted, mesh, vertex_sigma(mesh, maps, adjusted.poses, workers=workers).astype(float))
         save_stage2(store, key, stage)
         return stage
 

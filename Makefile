@@ -1,0 +1,54 @@
+# `make demo` or `make test` alone does everything: the set-up comes first and is skipped when it is up to date.
+# PYTHON=python3.12 chooses the interpreter that .venv is made with.
+
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help setup demo test lint bench clean
+
+PYTHON ?= python3
+VENV := .venv
+RUN := $(VENV)/bin
+STAMP := $(VENV)/.specimap-installed
+DEMO_OUT ?= out/demo
+
+help:
+	@echo "make setup   install into $(VENV), pinned versions"
+	@echo "make demo    set up, then run the pipeline on samples/ into $(DEMO_OUT)"
+	@echo "make test    set up, then run the tests"
+	@echo "make lint    ruff and mypy"
+	@echo "make bench   time, memory and accuracy beside the published figures"
+	@echo "make clean   remove $(VENV) and out/"
+
+setup: $(STAMP)
+
+$(RUN)/python:
+	@command -v "$(PYTHON)" >/dev/null || { echo "There is no $(PYTHON). Install Python 3.11 or later: sudo apt install python3 python3-venv" >&2; exit 1; }
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+		echo "$(PYTHON) is $$("$(PYTHON)" -V 2>&1); Specimap needs Python 3.11 or later. Name one: make setup PYTHON=python3.12" >&2; exit 1; }
+	@"$(PYTHON)" -m venv $(VENV) || { rm -rf $(VENV); \
+		echo "No virtual environment could be made. Run this, then make again: sudo apt install python3-venv" >&2; exit 1; }
+
+$(STAMP): pyproject.toml requirements.lock | $(RUN)/python
+	@$(RUN)/python -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+		echo "$(VENV) holds $$($(RUN)/python -V 2>&1); Specimap needs 3.11 or later. Remove $(VENV) and run make again." >&2; exit 1; }
+	@echo "Installing into $(VENV) (about 2.5 GB on disk; some minutes the first time)"
+	@$(RUN)/python -m pip install --quiet --disable-pip-version-check --requirement requirements.lock
+	@$(RUN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch $@
+
+demo: setup
+	$(RUN)/specimap run --photos samples/rgb --cube samples/hsi/hsi.hdr --out $(DEMO_OUT)
+
+test: setup
+	$(RUN)/python -m pytest
+
+lint: setup
+	$(RUN)/ruff check .
+	$(RUN)/mypy
+
+bench: setup
+	$(RUN)/python -m bench
+
+clean:
+	rm -rf $(VENV) out

@@ -1,0 +1,114 @@
+"""Accuracy against truth: where each spectrum of the specimen lies, and where it truly was measured."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from bench.measure import Measured, measure
+from bench.real import APPLE, bench_apple
+from bench.sample import SAMPLE
+from specimap.core.accuracy import TruthComparison, compare_with_truth
+from specimap.core.cloud import Cloud
+from specimap.core.phantom import load_truth
+
+SPECIMEN = 1
+
+
+@dataclass(frozen=True)
+class Case:
+    """An acquisition with truth: ``folder``, and the ``share`` of its photos that is used, evenly dropped."""
+
+    name: str
+    folder: Path
+    share: float = 1.0
+
+
+def cases(data: Path | None) -> list[Case]:
+    """The sample, and the phantoms where the test data are at hand."""
+    found = [Case("sample", SAMPLE)]
+    if data is not None:
+        phantom = data / "phantom_a"
+        found += [
+            Case("phantom A", phantom),
+            Case("phantom A, 80 % of the photos", phantom, 0.8),
+            Case("phantom A, 50 % of the photos", phantom, 0.5),
+            Case("phantom hard", data / "phantom_hard"),
+        ]
+    return found
+
+
+def evenly(items: Sequence[Path], share: float) -> list[Path]:
+    """A share of ``items``, those left out spread evenly."""
+    count = round(share * len(items))
+    return [items[k] for k in np.floor((np.arange(count) + 0.5) * len(items) / count).astype(int)]
+
+
+def judge(out: Path, folder: Path) -> TruthComparison:
+    """The cloud of a finished run in ``out`` against the truth in ``folder``."""
+    truth, cloud = load_truth(folder), Cloud.open(out / "cloud.zarr")
+    corners = json.loads((out / "corners.json").read_text(encoding="utf-8"))
+    both = [k for k, i in enumerate(truth.marker_ids) if str(i) in corners]
+    return compare_with_truth(
+        cloud.hsi_pixel, cloud.xyz, np.array([corners[str(truth.marker_ids[k])] for k in both]),
+        truth.marker_corners[both], truth.hsi_xyz.astype(float), truth.hsi_class == SPECIMEN,
+    )  # fmt: skip
+
+
+def bench_accuracy(console: Console, work: Path, repeats: int) -> dict[str, object]:
+    """One run a case, by the camera and by the published homography; ``repeats`` does not apply: runs are seeded."""
+    del repeats
+    value = os.environ.get("SPECIMAP_TEST_DATA")
+    data = Path(value) if value else None
+    table = Table(title="Position of the specimen's spectra against truth", title_justify="left")
+    for heading in (
+        "acquisition", "photos used", "median mm", "p95 mm", "coverage", "scale", "2D corner mm", "3D corner mm",
+        "homography median / p95 mm", "seconds",
+    ):  # fmt: skip
+        first = heading == "acquisition"
+        table.add_column(heading, justify="left" if first else "right", no_wrap=first)
+    figures: dict[str, object] = {}
+    for number, case in enumerate(cases(data)):
+        photos, out = work / f"case_{number}", work / f"case_{number}_out"
+        photos.mkdir(exist_ok=True)
+        for photo in evenly(sorted((case.folder / "rgb").iterdir()), case.share):
+            shutil.copyfile(photo, photos / photo.name)
+        run = _measured(photos, case, out, "camera")
+        camera = judge(out, case.folder)
+        _measured(photos, case, out, "homography")
+        flat = judge(out, case.folder)
+        said = run.result
+        table.add_row(
+            case.name, f"{said['photos'][0]} of {said['photos'][1]}", f"{camera.median:.3f}", f"{camera.p95:.3f}",
+            f"{100 * camera.coverage:.1f} %", f"{100 * camera.scale:+.2f} %", f"{said['corner_2d_mm']:.3f}",
+            f"{said['corner_3d_mm']:.3f}", f"{flat.median:.3f} / {flat.p95:.3f}", f"{run.whole.wall_s:.1f}",
+        )  # fmt: skip
+        figures[case.name] = {
+            "camera": _figures(camera), "homography": _figures(flat), "seconds": run.whole.wall_s, "report": said,
+        }  # fmt: skip
+    console.print(table)
+    if data is None:
+        console.print("SPECIMAP_TEST_DATA is not set: only the sample was judged.")
+    elif (data / APPLE).is_dir():
+        figures["apple"] = bench_apple(console, data / APPLE)
+    return figures
+
+
+def _measured(photos: Path, case: Case, out: Path, method: str) -> Measured:
+    header = case.folder / "hsi" / "hsi.hdr"
+    return measure(["--photos", str(photos), "--cube", str(header), "--out", str(out), "--method", method])
+
+
+def _figures(found: TruthComparison) -> dict[str, float]:
+    return {
+        "median_mm": found.median, "p95_mm": found.p95, "coverage": found.coverage, "scale": found.scale,
+        "corner_mm": found.corner_mm,
+    }  # fmt: skip

@@ -1,0 +1,93 @@
+"""The measured process. Says on standard output when a stage begins, and at the end what came out."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+
+from specimap.cli.options import settings_from
+from specimap.core.cube import open_cube
+from specimap.core.pipeline import Inputs, Outputs, run_pipeline
+from specimap.core.pipeline.artefacts import load_stage1, load_stage2
+from specimap.core.pipeline.finish import register_and_write
+from specimap.core.pipeline.outputs import prepare_folder
+from specimap.core.pipeline.run import Clock
+from specimap.core.pipeline.settings import PipelineSettings
+from specimap.core.report import Report
+
+
+class _Steps:
+    """Notes where one stage ends and the next begins."""
+
+    def __init__(self) -> None:
+        self._stage = "start"
+
+    def __call__(self, stage: str, share: float) -> None:
+        if stage != self._stage:
+            self._stage = stage
+            self.say(stage=stage)
+
+    @staticmethod
+    def say(**event: object) -> None:
+        sys.stdout.write(json.dumps({"cpu": time.process_time(), **event}) + "\n")
+        sys.stdout.flush()
+
+
+def _settings(options: Namespace) -> PipelineSettings:
+    return settings_from(
+        edge_mm=options.edge_mm, dictionary=options.dictionary, method=options.method, adjustment="rigid", r_pc=0.5,
+        r_reg=2.0, backend="colmap", working_px=1280,
+    )  # fmt: skip
+
+
+def _said(report: Report) -> dict[str, object]:
+    return {
+        "photos": [len(report.photos.used), report.photos.given],
+        "corner_2d_mm": report.corner_2d_mm.mean,
+        "corner_3d_mm": report.corner_3d_mm.median,
+        "edge_mm": [report.edge_length_mm.mean, report.edge_length_mm.std],
+        "points": report.coverage.points,
+        "seconds": report.seconds,
+    }
+
+
+def _run(options: Namespace, steps: _Steps) -> Report:
+    return run_pipeline(Inputs(options.photos, options.cube), options.out, _settings(options), progress=steps)
+
+
+def _register(options: Namespace, steps: _Steps) -> Report:
+    """Stages 3 and 4 of a cube on the reconstruction that an earlier run left in ``options.run``."""
+    store, keys = Outputs(options.run).store, {}
+    for path in store.folder.glob("*.npz"):
+        stage, _, keys[stage] = path.stem.partition("-")
+    stage1, stage2 = load_stage1(store, keys["reconstruct"]), load_stage2(store, keys["adjust"])
+    if stage1 is None or stage2 is None:
+        raise RuntimeError(f"{options.run} holds no finished reconstruction")
+    prepare_folder(options.out)
+    clock = Clock(steps, lambda: False)
+    # Opening the cube belongs to the stage; its hash is taken while stage 1 works, as a run does.
+    cube = open_cube(options.cube)
+    return register_and_write(stage1, stage2, cube, _settings(options), Outputs(options.out), clock, [], {})
+
+
+def main() -> None:
+    """Parse, run, say."""
+    parser = ArgumentParser()
+    parser.add_argument("--edge-mm", type=float, default=6.8)
+    parser.add_argument("--dictionary", default="DICT_4X4_50")
+    parser.add_argument("--method", default="camera")
+    parser.add_argument("--photos", type=Path)
+    parser.add_argument("--run", type=Path)
+    parser.add_argument("--cube", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    options = parser.parse_args()
+    steps = _Steps()
+    report = _register(options, steps) if options.run else _run(options, steps)
+    steps.say(stage="end", result=_said(report))
+
+
+if __name__ == "__main__":
+    main()

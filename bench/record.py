@@ -1,0 +1,21 @@
+"""Results are kept: one JSON file a run, never overwritten."""
+
+from __future__ import annotations
+
+import datetime
+import json
+from pathlib import Path
+
+from bench.machine import describe
+from specimap.core.files import write_text
+
+RESULTS = Path(__file__).parent / "results"
+
+
+def keep(part: str, figures: object, machine: dict[str, object] | None = None) -> Path:
+    """Write ``figures`` with machine and time into ``bench/results/``; the path written."""
+    now = datetime.datetime.now(datetime.UTC)
+    path = RESULTS / f"{now:%Y%m%dT%H%M%SZ}-{part}.json"
+    document = {"part": part, "time": now.isoformat(timespec="seconds"), "machine": machine or describe()}
+    write_text(path, json.dumps(document | {"figures": figures}, indent=1))
+    return path

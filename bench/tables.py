@@ -1,0 +1,92 @@
+"""``python -m bench.tables``: the newest accuracy record into README.md and docs/accuracy.md, between their marks."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from bench.record import RESULTS
+from specimap.core.files import write_text
+
+ROOT = Path(__file__).resolve().parent.parent
+REAL = "apple"
+
+
+def newest(part: str) -> dict[str, Any]:
+    """Figures of the newest record of ``part``. Raises FileNotFoundError where there is none."""
+    records = sorted(RESULTS.glob(f"*-{part}.json"))
+    if not records:
+        raise FileNotFoundError(f"bench/results/ holds no record of {part}: run python -m bench --only {part}")
+    figures: dict[str, Any] = json.loads(records[-1].read_text(encoding="utf-8"))["figures"]
+    return figures
+
+
+def short_table(figures: dict[str, Any]) -> str:
+    """For the README."""
+    rows = ["| acquisition | photos used | median mm | p95 mm | coverage | `homography`: median, p95 mm |",
+            "|---|---|---|---|---|---|"]  # fmt: skip
+    for name, case in _cases(figures):
+        used, given = case["report"]["photos"]
+        flat, best = case["homography"], case["camera"]
+        rows.append(
+            f"| {name} | {used} of {given} | {best['median_mm']:.3f} | {best['p95_mm']:.2f} "
+            f"| {100 * best['coverage']:.1f} % | {flat['median_mm']:.2f}, {flat['p95_mm']:.2f} |"
+        )
+    if REAL in figures:
+        rows += ["", f"On real photos: {real_line(figures[REAL])}"]
+    return "\n".join(rows)
+
+
+def long_table(figures: dict[str, Any]) -> str:
+    """For docs/accuracy.md."""
+    rows = ["| acquisition | photos used | median mm | p95 mm | coverage | scale | 2D corner mm | 3D corner mm "
+            "| `homography`: median, p95 mm |", "|---|---|---|---|---|---|---|---|---|"]  # fmt: skip
+    for name, case in _cases(figures):
+        used, given = case["report"]["photos"]
+        flat, best, said = case["homography"], case["camera"], case["report"]
+        rows.append(
+            f"| {name} | {used} of {given} | {best['median_mm']:.3f} | {best['p95_mm']:.3f} "
+            f"| {100 * best['coverage']:.2f} % | {100 * best['scale']:+.2f} % | {said['corner_2d_mm']:.3f} "
+            f"| {said['corner_3d_mm']:.3f} | {flat['median_mm']:.3f}, {flat['p95_mm']:.3f} |"
+        )
+    return "\n".join(rows)
+
+
+def real_line(real: dict[str, Any]) -> str:
+    """The printed board in one sentence."""
+    (used, given), (mean, std) = real["photos"], real["edge_mm"]
+    return (
+        f"{used} of {given} photos used, {real['markers']} markers, printed edges {mean:.3f} mm on average, "
+        f"standard deviation {100 * std / mean:.2f} %, corners {real['rms_px']:.2f} px RMS, mesh after "
+        f"{real['seconds']:.0f} s."
+    )
+
+
+def put(page: Path, mark: str, text: str) -> None:
+    """Replace what stands between ``<!-- mark -->`` and ``<!-- /mark -->`` of a page."""
+    old = page.read_text(encoding="utf-8")
+    new, count = re.subn(
+        rf"(<!-- {mark} -->\n).*?(<!-- /{mark} -->)", lambda m: f"{m[1]}{text}\n{m[2]}", old, flags=re.DOTALL
+    )
+    if count != 1:
+        raise ValueError(f"{page.name} has {count} places marked {mark}")
+    write_text(page, new)
+
+
+def main() -> None:
+    """Fill the documents."""
+    figures = newest("accuracy")
+    put(ROOT / "README.md", "accuracy", short_table(figures))
+    put(ROOT / "docs" / "accuracy.md", "accuracy", long_table(figures))
+    if REAL in figures:
+        put(ROOT / "docs" / "accuracy.md", "apple", real_line(figures[REAL]))
+
+
+def _cases(figures: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    return [(name, case) for name, case in figures.items() if name != REAL]
+
+
+if __name__ == "__main__":
+    main()
