@@ -11,9 +11,9 @@ from rich.console import Console
 
 from specimap.cli.options import settings_from
 from specimap.core.acquisition import photo_paths
-from specimap.core.pipeline.finish import _edges
+from specimap.core.pipeline.finish import triangulated_edges
 from specimap.core.pipeline.outputs import Outputs
-from specimap.core.pipeline.run import Clock, _adjust, _reconstruct
+from specimap.core.pipeline.run import Clock, adjust_stage, reconstruct_stage
 
 APPLE = "real_aruco_apple"
 EDGE_MM = 33.0
@@ -30,10 +30,10 @@ def bench_apple(console: Console, folder: Path) -> dict[str, object]:
     with tempfile.TemporaryDirectory() as scratch:
         store, clock = Outputs(Path(scratch)).store, Clock(lambda stage, share: None, lambda: False)
         start = time.perf_counter()
-        stage1 = _reconstruct(photo_paths(folder / "images"), settings, store, "a", clock, workers)
-        stage2 = _adjust(stage1, settings, store, "b", clock, workers)
+        stage1 = reconstruct_stage(photo_paths(folder / "images"), settings, store, "a", clock, workers)
+        stage2 = adjust_stage(stage1, settings, store, "b", clock, workers)
         seconds = time.perf_counter() - start
-    edges = _edges(stage1, stage2.adjusted, EDGE_MM)
+    edges = triangulated_edges(stage1, stage2.adjusted, EDGE_MM)
     markers, vertices = len(stage2.adjusted.marker_ids), len(stage2.mesh.vertices)
     used, given = len(stage1.reconstruction.photos), len(stage1.names) + len(stage1.refused)
     console.print(

@@ -22,7 +22,7 @@ from specimap.core.errors import NotFoundError, PhotoUnreadableError, TooFewPhot
 register_heif_opener()
 
 PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".heic", ".heif"})
-PHOTO_FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "HEIF")
+PHOTO_FORMATS = ("JPEG", "PNG", "TIFF", "HEIF")
 """Whatever a file is called, Pillow's other parsers (PostScript among them) do not get to see it."""
 LARGEST_PHOTO_PIXELS = 250_000_000
 # Pillow's own limit warns at 90 million pixels, which phones exceed, and on standard error; photos are judged by

@@ -12,6 +12,8 @@ from pathlib import Path
 
 from specimap.core.errors import OutputNotWritableError, StorageFullError
 
+UNWRITABLE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.ENOENT, errno.ENAMETOOLONG, errno.ELOOP)
+
 
 @contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
@@ -24,7 +26,7 @@ def disk_errors(path: Path) -> Iterator[None]:
                 f"The disk filled up while writing {path.name}.",
                 advice="Free space or choose another output folder; finished stages are kept.",
             ) from error
-        if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        if error.errno in UNWRITABLE:
             raise OutputNotWritableError(
                 f"{path} cannot be written: {error.strerror}.",
                 advice="Choose a folder that you may write to.",

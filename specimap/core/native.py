@@ -5,6 +5,8 @@ from __future__ import annotations
 import ctypes
 import importlib
 import sys
+import threading
+from contextlib import suppress
 from types import ModuleType
 
 from specimap.core.errors import BackendUnavailableError
@@ -16,8 +18,6 @@ def open3d() -> ModuleType:
     Raises:
         BackendUnavailableError: it cannot be loaded; the advice names the one command that mends it.
     """
-    if "open3d" in sys.modules:
-        return sys.modules["open3d"]
     if sys.platform == "linux":
         try:
             ctypes.CDLL("libusb-1.0.so.0", mode=ctypes.RTLD_GLOBAL)
@@ -37,3 +37,13 @@ def open3d() -> ModuleType:
             f"Open3D does not load: {error}.",
             advice="Install the system libraries it wants: sudo apt-get install libusb-1.0-0 libgomp1 libgl1",
         ) from error
+
+
+def preload() -> None:
+    """Load Open3D in the background: its second of importing hides behind other work; errors come when it is used."""
+
+    def load() -> None:
+        with suppress(BackendUnavailableError):
+            open3d()
+
+    threading.Thread(target=load, daemon=True).start()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,8 @@ from specimap.core.solver import Observations
 from specimap.core.surface import Mesh
 
 DEPTH_STEPS = 65534
+FORMAT = 1
+"""Counts up when what a stage saves, or how a stage computes it, changes: older artefacts are then not reused."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,10 @@ class Stage1:
     subject_mm: float | None
     greys: tuple[NDArray[np.uint8], ...]
 
+    def without_depth(self) -> Stage1:
+        """The same without depth maps and images, for what comes after the mesh."""
+        return replace(self, reconstruction=replace(self.reconstruction, maps=()), greys=())
+
 
 @dataclass(frozen=True)
 class Stage2:
@@ -48,7 +54,7 @@ class Stage2:
 
 def key_of(stage: str, parts: Mapping[str, object]) -> str:
     """Hash of a stage's name, the program's version and what went into the stage."""
-    text = json.dumps({"stage": stage, "version": __version__, **parts}, sort_keys=True, default=str)
+    text = json.dumps({"stage": stage, "version": __version__, "format": FORMAT, **parts}, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 

@@ -114,7 +114,7 @@ def register_and_write(
             corner_3d_mm=own.corner_3d_mm,
             leave_one_marker_out_mm=own.leave_one_marker_out_mm,
             methods=figures,
-            edge_length_mm=_edges(stage1, adjusted, settings.adjust.edge_mm),
+            edge_length_mm=triangulated_edges(stage1, adjusted, settings.adjust.edge_mm),
             corner_sigma_mm=float(np.median(adjusted.sigma_corner_mm)),
             reprojection_px=Reprojection(before=adjusted.rms_before_px, after=adjusted.rms_after_px),
             photos=Photos(
@@ -176,7 +176,7 @@ def _registration_mm(camera: CubeCamera) -> float:
     return camera.rms_px * float(view.cam_from_world.centre[2]) / view.intrinsics.focal_px
 
 
-def _edges(stage1: Stage1, adjusted: Adjusted, expected: float) -> EdgeLength:
+def triangulated_edges(stage1: Stage1, adjusted: Adjusted, expected: float) -> EdgeLength:
     """Edges of corners triangulated one by one: rigid squares would only repeat the known edge."""
     seen = stage1.corners.seen
     place = {photo: k for k, photo in enumerate(stage1.reconstruction.photos)}

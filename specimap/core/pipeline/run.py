@@ -18,6 +18,7 @@ from specimap.core.acquisition import Photo, Refusal, photo_paths, read_photos
 from specimap.core.adjust import adjust
 from specimap.core.cube import inspect, open_cube
 from specimap.core.errors import CancelledError
+from specimap.core.native import preload
 from specimap.core.pipeline.artefacts import (
     Stage1,
     Stage2,
@@ -114,13 +115,15 @@ def run_pipeline(
             "reconstruct",
             {"photos": digests, "acquisition": asdict(settings.acquisition), "s": asdict(settings.reconstruct)},
         )
-        stage1 = _reconstruct(paths, settings, outputs.store, key1, clock, workers)
+        stage1 = reconstruct_stage(paths, settings, outputs.store, key1, clock, workers)
         key2 = key_of(
             "adjust",
             {"before": key1, "s": asdict(settings.adjust), "surface": asdict(settings.surface),
              "refine": asdict(settings.refine)},
         )  # fmt: skip
-        stage2 = _adjust(stage1, settings, outputs.store, key2, clock, workers)
+        stage2 = adjust_stage(stage1, settings, outputs.store, key2, clock, workers)
+        # A cube of a gigabyte comes next; the depth maps have done their work.
+        stage1 = stage1.without_depth()
         key4 = key_of(
             "register",
             {"before": key2, "cube": fingerprint.result(), "render": asdict(settings.render),
@@ -167,7 +170,7 @@ def _finished(outputs: Outputs, key: str) -> Report | None:
     return report if report.inputs.get("key") == key else None
 
 
-def _reconstruct(
+def reconstruct_stage(
     paths: list[Path], settings: PipelineSettings, store: Store, key: str, clock: Clock, workers: int
 ) -> Stage1:
     with clock.stage("reconstruct") as progress:
@@ -175,6 +178,7 @@ def _reconstruct(
         if found is not None:
             clock.reused.append("reconstruct")
             return found
+        preload()
         photos, refused = read_photos(
             paths, settings.acquisition, workers=workers, progress=lambda s: progress(0.08 * s)
         )
@@ -202,7 +206,7 @@ def _subject_mm(photos: list[Photo]) -> float | None:
     return float(np.median(stated)) if stated else None
 
 
-def _adjust(
+def adjust_stage(
     stage1: Stage1, settings: PipelineSettings, store: Store, key: str, clock: Clock, workers: int
 ) -> Stage2:
     with clock.stage("adjust") as progress:

@@ -15,7 +15,8 @@ from specimap.core.reconstruct.backend import (
     ReconstructSettings,
     sparse_points,
 )
-from specimap.core.reconstruct.depth import dense_depth, volume_over
+from specimap.core.reconstruct.dense import dense_depth
+from specimap.core.reconstruct.depth import volume_over
 from specimap.core.reconstruct.features import Locator
 from specimap.core.reconstruct.markers import MarkerSolution, solve_from_markers
 

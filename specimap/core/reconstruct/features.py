@@ -56,10 +56,12 @@ def extract(photo: Photo) -> Features:
     options.num_threads = 1
     options.sift.peak_threshold = 0.002
     options.sift.max_num_features = MOST_FEATURES
-    keypoints, descriptors = pycolmap.Sift(options).extract(np.ascontiguousarray(photo.grey))
-    unit = np.asarray(descriptors, np.float32)
+    extractor = pycolmap.FeatureExtractor.create(options)
+    keypoints, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(photo.grey))
+    unit = np.asarray(descriptors.data, np.float32)
     unit = unit / np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-9)
-    return Features(opencv_from_colmap(np.asarray(keypoints[:, :2], float)), unit)
+    xy = np.array([(k.x, k.y) for k in keypoints], float).reshape(-1, 2)
+    return Features(opencv_from_colmap(xy), unit.reshape(-1, 128))
 
 
 def match(a: Features, b: Features) -> NDArray[np.int64]:
