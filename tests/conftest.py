@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+pytest_plugins = ("scenes",)
+
 TEST_DATA_VARIABLE = "SPECIMAP_TEST_DATA"
 
 

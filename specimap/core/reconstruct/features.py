@@ -6,6 +6,8 @@ photo without a pose is then resected by LO-RANSAC (COLMAP). Linear in the numbe
 
 from __future__ import annotations
 
+import signal
+import threading
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -47,6 +49,10 @@ class Located:
 
 # COLMAP reports every extractor it makes on standard error.
 pycolmap.logging.minloglevel = pycolmap.logging.WARNING
+# Importing COLMAP puts a handler of its own on SIGTERM, which prints a stack and ends the program; who runs this
+# program may want to stop in order.
+if threading.current_thread() is threading.main_thread():
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
 
 
 def extract(photo: Photo) -> Features:

@@ -1,0 +1,239 @@
+"""Marker corners: found, without bias, and in the standard order."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from specimap.core.acquisition import AcquisitionSettings, Photo, read_photo
+from specimap.core.errors import (
+    DuplicateMarkersError,
+    NoMarkersFoundError,
+    UnknownDictionaryError,
+    WrongDictionaryError,
+)
+from specimap.core.fiducials import (
+    detect_markers,
+    dictionary_named,
+    fitting_dictionaries,
+    linear_from_srgb,
+)
+from specimap.core.geometry import Floats
+from specimap.core.phantom.render import srgb_from_linear
+from specimap.core.reconstruct.backend import corners_in_photos
+
+Bytes = NDArray[np.uint8]
+
+
+def picture(
+    markers: dict[int, Floats],
+    *,
+    dictionary: str = "DICT_4X4_50",
+    shape: tuple[int, int] = (300, 400),
+    blur_px: float = 0.8,
+    noise: float = 1.0,
+    seed: int = 0,
+) -> Bytes:
+    """A grey sRGB picture with markers whose outer corners (4, 2) lie exactly at the given places.
+
+    Drawn eight times as large in linear light, averaged, blurred, then encoded: as a lens and a sensor do it.
+    """
+    fine, cells = 8, 0
+    height, width = shape
+    linear: NDArray[np.float32] = np.full((height * fine, width * fine), 0.75, np.float32)
+    for marker_id, corners in markers.items():
+        drawn = cv2.aruco.generateImageMarker(dictionary_named(dictionary), marker_id, 240)
+        cells = drawn.shape[0]
+        # The black square ends half a pixel outside the outermost pixels' centres.
+        source = np.array([[-0.5, -0.5], [cells - 0.5, -0.5], [cells - 0.5, cells - 0.5], [-0.5, cells - 0.5]])
+        target = (corners + 0.5) * fine - 0.5
+        H = cv2.getPerspectiveTransform(source.astype(np.float32), target.astype(np.float32))
+        mask = cv2.warpPerspective(np.ones_like(drawn), H, linear.shape[::-1], flags=cv2.INTER_NEAREST)
+        warped = cv2.warpPerspective(drawn, H, linear.shape[::-1], flags=cv2.INTER_NEAREST)
+        linear[mask > 0] = np.where(warped[mask > 0] > 127, 0.75, 0.03)
+    light = cv2.GaussianBlur(cv2.resize(linear, (width, height), interpolation=cv2.INTER_AREA), (0, 0), blur_px)
+    encoded = np.asarray(srgb_from_linear(light), float) * 255
+    encoded = encoded + noise * np.random.default_rng(seed).standard_normal(encoded.shape)
+    return np.asarray(np.clip(encoded + 0.5, 0, 255), np.uint8)
+
+
+def square(x: float, y: float, size: float, angle_deg: float = 0.0, lean: float = 0.0) -> Floats:
+    """A square seen at an angle: top-left, top-right, bottom-right, bottom-left."""
+    a = np.radians(angle_deg)
+    turn = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
+    unit = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5 + lean, 0.5], [-0.5 + lean, 0.5]])
+    return np.asarray(np.array([x, y]) + size * unit @ turn.T)
+
+
+LAYOUT = {
+    0: square(80.3, 70.7, 41.2, 12, 0.2),
+    1: square(300.6, 80.1, 38.5, -33, -0.15),
+    2: square(310.2, 220.4, 44.9, 61, 0.1),
+    3: square(90.8, 215.9, 36.4, 175),
+}
+
+
+@pytest.mark.parametrize("blur_px", [0.6, 1.0])
+def test_corners_are_found_where_they_are(blur_px: float) -> None:
+    found = detect_markers(picture(LAYOUT, blur_px=blur_px), "DICT_4X4_50", expected=4)
+    assert [d.marker_id for d in found] == [0, 1, 2, 3]
+    errors = np.stack([d.corners_px - LAYOUT[d.marker_id] for d in found])
+    distance = np.linalg.norm(errors, axis=-1)
+    assert 0.002 < np.median(distance) < 0.08
+    assert distance.max() < 0.25
+
+
+def test_corners_are_not_pulled_inward() -> None:
+    """OpenCV's own refinement on the encoded picture is; lines on linear light are not."""
+    inward: dict[str, list[float]] = {"lines": [], "subpix": []}
+    for seed in range(4):
+        grey = picture(LAYOUT, blur_px=1.1, seed=seed)
+        for d in detect_markers(grey, "DICT_4X4_50"):
+            truth = LAYOUT[d.marker_id]
+            outward = truth - truth.mean(0)
+            outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+            coarse = d.corners_px.astype(np.float32)[:, None]
+            criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 0.001)
+            subpix = cv2.cornerSubPix(grey, coarse.copy(), (4, 4), (-1, -1), criteria)[:, 0]
+            inward["lines"] += list(-((d.corners_px - truth) * outward).sum(1))
+            inward["subpix"] += list(-((subpix - truth) * outward).sum(1))
+    assert abs(float(np.mean(inward["lines"]))) < 0.04
+    assert float(np.mean(inward["subpix"])) > 0.1
+
+
+def test_the_stated_sigma_is_of_the_errors_size() -> None:
+    errors, sigmas = [], []
+    for seed in range(6):
+        for d in detect_markers(picture(LAYOUT, noise=4.0, seed=seed), "DICT_4X4_50"):
+            errors.append(d.corners_px - LAYOUT[d.marker_id])
+            sigmas.append(d.sigma_px)
+    ratio = float(np.std(errors)) / float(np.median(sigmas))
+    assert 0.3 < ratio < 3.0
+
+
+def test_a_defocused_marker_is_found_by_the_second_search() -> None:
+    grey = picture({5: square(200.3, 150.2, 26, 10)}, blur_px=2.0)
+    assert not detect_markers(grey, "DICT_4X4_50", expected=0)
+    assert [d.marker_id for d in detect_markers(grey, "DICT_4X4_50", expected=1)] == [5]
+
+
+def test_a_covered_edge_is_told_by_a_large_sigma() -> None:
+    grey = picture({7: square(200, 150, 60)})
+    clean = detect_markers(grey, "DICT_4X4_50")[0].sigma_px
+    grey[120:180, 172:186] = grey[0, 0]  # paper over the border's inner part on one side: the edge stays, ragged
+    ragged = grey.copy()
+    rng = np.random.default_rng(0)
+    ragged[118:182, 165:172] = rng.integers(40, 220, (64, 7), dtype=np.uint8)
+    for d in detect_markers(ragged, "DICT_4X4_50", expected=1):
+        assert d.sigma_px > clean
+
+
+def test_an_unknown_dictionary_is_refused_with_the_known_ones() -> None:
+    for name in ("DICT_4X4_51", "CORNER_REFINE_NONE", "", "__class__"):
+        with pytest.raises(UnknownDictionaryError) as refused:
+            dictionary_named(name)
+        assert "DICT_4X4_50" in refused.value.advice
+
+
+def test_the_fitting_dictionary_is_named() -> None:
+    shown = [picture(LAYOUT, dictionary="DICT_5X5_100", seed=s) for s in range(3)]
+    assert next(iter(fitting_dictionaries(shown))) == "DICT_5X5_1000"
+    rng = np.random.default_rng(0)
+    texture = [cv2.GaussianBlur(rng.integers(0, 256, (300, 400), dtype=np.uint8), (0, 0), 4) for _ in range(3)]
+    assert not fitting_dictionaries([np.asarray(cv2.normalize(t, None, 0, 255, cv2.NORM_MINMAX)) for t in texture])
+
+
+def test_linear_light_is_srgbs() -> None:
+    values = np.arange(256, dtype=np.uint8)
+    linear = linear_from_srgb(values)
+    assert linear[0] == 0
+    assert linear[255] == 1
+    assert np.isclose(linear[128], 0.2158605, atol=1e-6)
+    assert (np.diff(linear) > 0).all()
+
+
+# ---- all photos together ------------------------------------------------------------------------------
+
+
+def photo_of(grey: Bytes, name: str) -> Photo:
+    image = np.repeat(grey[..., None], 3, axis=2)
+    return Photo(name, image, (grey.shape[1], grey.shape[0]), None, None, 1.0, name)
+
+
+def gathered(greys: list[Bytes], dictionary: str = "DICT_4X4_50") -> tuple[int, ...]:
+    photos = [photo_of(g, f"{k}.jpg") for k, g in enumerate(greys)]
+    found = [detect_markers(g, dictionary) for g in greys]
+    return corners_in_photos(photos, found, dictionary).marker_ids
+
+
+def test_an_id_on_two_markers_is_refused() -> None:
+    rng = np.random.default_rng(0)
+    pictures = []
+    for k in range(5):
+        grey = picture(LAYOUT, seed=k)
+        other = picture({0: square(200 + rng.uniform(-2, 2), 150, 40)}, seed=k)
+        grey[110:190, 160:240] = other[110:190, 160:240]
+        pictures.append(grey)
+    with pytest.raises(DuplicateMarkersError) as refused:
+        gathered(pictures)
+    assert refused.value.details["ids"] == [0]
+
+
+def test_a_false_reading_in_one_photo_is_left_out() -> None:
+    pictures = [picture(LAYOUT, seed=k) for k in range(4)]
+    stray = picture({17: square(200, 150, 30)})
+    pictures[0][110:190, 160:240] = stray[110:190, 160:240]
+    assert gathered(pictures) == (0, 1, 2, 3)
+
+
+def test_another_dictionary_is_named_even_where_the_given_one_reads_a_few() -> None:
+    pictures = [picture(LAYOUT, dictionary="DICT_6X6_250", seed=k) for k in range(6)]
+    with pytest.raises(WrongDictionaryError) as refused:
+        gathered(pictures)
+    assert "DICT_6X6_1000" in refused.value.advice
+    for k in (0, 1):  # the same false marker in two photos counts as seen
+        stray = picture({17: square(200, 150, 30)})
+        pictures[k][110:190, 160:240] = stray[110:190, 160:240]
+    with pytest.raises(WrongDictionaryError):
+        gathered(pictures)
+
+
+def test_no_marker_anywhere_is_refused_as_that() -> None:
+    rng = np.random.default_rng(1)
+    greys = [
+        np.asarray(cv2.GaussianBlur(rng.integers(0, 256, (300, 400), dtype=np.uint8), (0, 0), 2), np.uint8)
+        for _ in range(6)
+    ]
+    with pytest.raises(NoMarkersFoundError) as refused:
+        gathered(greys)
+    assert refused.value.code == "no_markers_found"
+
+
+# ---- real pictures ------------------------------------------------------------------------------------
+
+
+def real(data_dir: Path, name: str) -> Bytes:
+    return read_photo(data_dir / name, AcquisitionSettings(working_px=4000)).grey
+
+
+@pytest.mark.parametrize(
+    ("name", "count"), [("singlemarkersoriginal.jpg", 6), ("choriginal.jpg", 17), ("chocclusion_original.jpg", 13)]
+)
+def test_real_markers_are_read(data_dir: Path, name: str, count: int) -> None:
+    found = detect_markers(real(data_dir, f"real_fiducial_opencv/{name}"), "DICT_6X6_250", expected=count)
+    assert abs(len(found) - count) <= 1
+    assert len({d.marker_id for d in found}) == len(found)
+    # Real print and paper: edges are found on most, and the sigma says how well.
+    assert 0.005 < float(np.median([d.sigma_px for d in found])) < 0.3
+
+
+def test_one_id_on_two_real_tags_is_reported_twice(data_dir: Path) -> None:
+    counts = []
+    for path in sorted((data_dir / "real_fiducial_apriltag").glob("*.jpg")):
+        ids = [d.marker_id for d in detect_markers(real(data_dir, str(path)), "DICT_APRILTAG_36h11")]
+        counts.append(len(ids) - len(set(ids)))
+    assert max(counts) >= 1
