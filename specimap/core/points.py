@@ -61,8 +61,13 @@ def cloud_points(
     corners: Floats,
     corner_sigma_mm: float,
     registration_mm: float,
+    parallax_mm: NDArray[np.float32] | None = None,
 ) -> CloudPoints:
-    """The cloud's points with their flags and standard deviations."""
+    """The cloud's points with their flags and standard deviations.
+
+    ``parallax_mm`` (S,): distance from where the solved camera puts the same pixels, where the places do not come
+    from it; it is an error of those places and counts in their standard deviation.
+    """
     if (placement.triangle >= 0).all():
         depth_sigma = caster.interpolate(
             sigma_of_vertex[:, None], placement.triangle, placement.barycentric
@@ -70,6 +75,8 @@ def cloud_points(
     else:
         depth_sigma = np.full(len(placement.xyz), np.float32(np.median(sigma_of_vertex)))
     sigma = point_sigma(depth_sigma, placement.incidence_deg, corner_sigma_mm, registration_mm)
+    if parallax_mm is not None:
+        sigma = np.hypot(sigma, np.nan_to_num(parallax_mm, nan=UNSEEN_SIGMA_MM)).astype(np.float32)
     card = on_card(placement.xyz, corners)
     specimen = on_specimen(placement.pixels, placement.xyz, card, corners)
     flags = (

@@ -32,6 +32,7 @@ from specimap.core.register.cube_markers import CubeMarkers, find_markers
 from specimap.core.register.register import (
     Placement,
     fit_homography,
+    homography_xyz,
     place_by_camera,
     place_by_homography,
 )
@@ -82,12 +83,20 @@ def register_and_write(
         flat = seen.flat()
         camera = solve_camera(*flat, cube.rows, cube.cols)
         homography = fit_homography(flat[0], flat[1], coarse, settings.register.ransac_px)
-        placements = {
-            "camera": place_by_camera(camera.view, caster, found.mirrored),
-            "homography": place_by_homography(homography, coarse, fine, camera.view, caster, found.mirrored),
-        }
+        by_camera = settings.register.method == "camera"
+        chosen = (
+            place_by_camera(camera.view, caster, found.mirrored)
+            if by_camera
+            else place_by_homography(homography, coarse, fine, camera.view, caster, found.mirrored)
+        )
+        pixels = _as_seen(chosen, found.mirrored, cube.cols)
+        other = (
+            homography_xyz(homography, coarse, fine, pixels)
+            if by_camera
+            else caster.cast(camera.view.cam_from_world.centre, camera.view.world_rays(pixels)).xyz
+        )
+        apart = np.linalg.norm(chosen.xyz - other, axis=1).astype(np.float32)
         progress(0.3)
-        chosen = placements[settings.register.method]
         points = cloud_points(
             chosen,
             caster,
@@ -95,6 +104,7 @@ def register_and_write(
             adjusted.corners,
             float(np.median(adjusted.sigma_corner_mm)),
             _registration_mm(camera),
+            None if by_camera else apart,
         )
         progress(0.35)
         figures = {
@@ -133,7 +143,7 @@ def register_and_write(
                 points=len(points),
                 specimen_points=int(((points.flags & Flag.SPECIMEN) > 0).sum()),
             ),
-            parallax_removed_mm=_parallax(placements, points, settings.register.method),
+            parallax_removed_mm=_parallax(apart[(points.flags & Flag.SPECIMEN) > 0]),
             sigma_mm=_sigma(points),
             cube_camera=_camera(camera, found, cube),
             photo_focal_px=adjusted.lens.focal_px,
@@ -204,20 +214,20 @@ def _coverage(view: View, mirrored: bool, corners: Floats, chosen: Placement, cu
     return float((inside & placed).sum() / max(int(inside.sum()), 1))
 
 
-def _parallax(placements: dict[str, Placement], points: CloudPoints, method: str) -> Parallax:
+def _as_seen(placement: Placement, mirrored: bool, cols: int) -> Floats:
+    """Pixels (S, 2) x, y as the camera saw them."""
+    pixels = placement.pixels[:, ::-1].astype(float)
+    if mirrored:
+        pixels[:, 0] = cols - 1 - pixels[:, 0]
+    return pixels
+
+
+def _parallax(apart: NDArray[np.float32]) -> Parallax:
     """How far apart the two methods put the specimen's pixels."""
-    shape = tuple(int(p.pixels.max()) + 1 if len(p.pixels) else 1 for p in placements.values())
-    side = max(shape)
-    index: NDArray[np.int32] = np.full((side, side), -1, np.int32)
-    other = placements["homography" if method == "camera" else "camera"]
-    index[other.pixels[:, 0], other.pixels[:, 1]] = np.arange(len(other.pixels))
-    on_it = (points.flags & Flag.SPECIMEN) > 0
-    partner = index[points.hsi_pixel[on_it, 0], points.hsi_pixel[on_it, 1]]
-    both = partner >= 0
-    if not both.any():
+    known = apart[np.isfinite(apart)]
+    if not known.size:
         return Parallax(median=0.0, maximum=0.0)
-    apart = np.linalg.norm(points.xyz[on_it][both] - other.xyz[partner[both]], axis=1)
-    return Parallax(median=float(np.median(apart)), maximum=float(apart.max()))
+    return Parallax(median=float(np.median(known)), maximum=float(known.max()))
 
 
 def _sigma(points: CloudPoints) -> SigmaFigures:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from specimap.core.errors import RegistrationError
 from specimap.core.geometry import Floats, View
@@ -16,6 +19,8 @@ from specimap.core.render import Grid
 
 Method = Literal["camera", "homography"]
 GRAZING_DEG = 70.0
+STRIP_PIXELS = 1 << 16
+STRIP_WORKERS = 2
 
 
 @dataclass(frozen=True)
@@ -71,54 +76,80 @@ def fit_homography(corners: Floats, corners_px: Floats, coarse: Grid, ransac_px:
     return Homography(np.asarray(H, float), inliers.ravel().astype(bool))
 
 
-def place_by_homography(homography: Homography, coarse: Grid, fine: Grid, view: View, caster: RayCaster,
-                        mirrored: bool) -> Placement:  # fmt: skip
-    """Map pixels onto the fine grid by diag(s, s, 1) H and look up xyz bilinearly, as published."""
-    lens = view.intrinsics
+def _map_to_fine(homography: Homography, coarse: Grid, fine: Grid, pixels: Floats) -> Floats:
+    """Cube pixels (N, 2) x, y, as the camera saw them, to pixels of the fine grid (N, 2): diag(s, s, 1) H."""
     s = coarse.cell_mm / fine.cell_mm
-    H = np.diag([s, s, 1.0]) @ homography.H
-    rows, cols = np.indices((lens.height, lens.width))
-    seen_cols = lens.width - 1 - cols if mirrored else cols
-    pixels = np.stack([seen_cols, rows, np.ones_like(rows)], -1).reshape(-1, 3).astype(float)
-    mapped = pixels @ H.T
-    at = (mapped[:, :2] / mapped[:, 2:]).astype(np.float32).reshape(lens.height, lens.width, 2)
+    mapped = np.c_[pixels, np.ones(len(pixels))] @ (np.diag([s, s, 1.0]) @ homography.H).T
+    return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
-    def look_up(values: NDArray[np.float32]) -> NDArray[np.float32]:
-        return np.asarray(
-            cv2.remap(values, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT,
-                      borderValue=float("nan"))
-        )  # fmt: skip
 
-    xyz = look_up(fine.xyz)
-    keep = np.isfinite(xyz).all(-1)
-    points = xyz[keep]
-    normal = look_up(fine.normal)[keep]
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    rgb = np.nan_to_num(look_up(fine.image.astype(np.float32))[keep])
-    return _placed(
-        np.stack([rows[keep], cols[keep]], -1), points, normal, np.clip(rgb + 0.5, 0, 255).astype(np.uint8),
-        view, caster, None,
-    )  # fmt: skip
+def homography_xyz(homography: Homography, coarse: Grid, fine: Grid, pixels: Floats) -> NDArray[np.float32]:
+    """Where the published method puts cube pixels (N, 2) x, y: xyz (N, 3) mm, NaN off the surface."""
+    at = _map_to_fine(homography, coarse, fine, pixels)[:, ::-1].T
+    return np.stack([map_coordinates(fine.xyz[..., k], at, order=1, cval=np.nan) for k in range(3)], -1)
+
+
+def place_by_homography(
+    homography: Homography, coarse: Grid, fine: Grid, view: View, caster: RayCaster, mirrored: bool
+) -> Placement:
+    """Map pixels onto the fine grid by diag(s, s, 1) H and look up xyz bilinearly, as published."""
+    layers = np.concatenate([fine.xyz, fine.normal, fine.image.astype(np.float32)], -1)
+
+    def place(rows: NDArray[np.int64], cols: NDArray[np.int64], seen: Floats) -> Placement:
+        at = _map_to_fine(homography, coarse, fine, seen)[:, ::-1].T
+        found = np.stack(
+            [map_coordinates(layers[..., k], at, order=1, cval=np.nan) for k in range(layers.shape[-1])], -1
+        )
+        keep = np.isfinite(found[:, :6]).all(-1)
+        xyz, normal, rgb = found[keep, :3], found[keep, 3:6], found[keep, 6:]
+        normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+        colours = np.clip(rgb + 0.5, 0, 255).astype(np.uint8)
+        return _placed(np.stack([rows[keep], cols[keep]], -1), xyz, normal, colours, view, caster, None)
+
+    return _in_strips(view, mirrored, place)
 
 
 def place_by_camera(view: View, caster: RayCaster, mirrored: bool) -> Placement:
-    """Cast each pixel's own ray onto the mesh: raised tissue lands where it is."""
+    """Cast each pixel's own ray onto the mesh: raised tissue lands where it is.
+
+    Raises:
+        RegistrationError: no ray meets the mesh.
+    """
+
+    def place(rows: NDArray[np.int64], cols: NDArray[np.int64], seen: Floats) -> Placement:
+        hits = caster.cast(view.cam_from_world.centre, view.world_rays(seen))
+        keep = hits.hit
+        normals, rgb = caster.normals(hits)[keep], caster.colours(hits)[keep]
+        return _placed(
+            np.stack([rows[keep], cols[keep]], -1), hits.xyz[keep], normals, rgb, view, caster,
+            (hits.triangle[keep], hits.barycentric[keep]),
+        )  # fmt: skip
+
+    return _in_strips(view, mirrored, place)
+
+
+def _in_strips(
+    view: View, mirrored: bool, place: Callable[[NDArray[np.int64], NDArray[np.int64], Floats], Placement]
+) -> Placement:
+    """Place the cube's pixels strip by strip, so that a large cube needs little more memory than its points."""
     lens = view.intrinsics
-    rows, cols = np.indices((lens.height, lens.width), dtype=np.int32).reshape(2, -1)
-    seen_cols = lens.width - 1 - cols if mirrored else cols
-    directions = view.world_rays(np.stack([seen_cols, rows], -1).astype(float))
-    hits = caster.cast(view.cam_from_world.centre, directions)
-    keep = hits.hit
-    if not keep.any():
+    at_once = max(1, STRIP_PIXELS // lens.width)
+
+    def strip(start: int) -> Placement:
+        rows, cols = np.indices((min(at_once, lens.height - start), lens.width)).reshape(2, -1)
+        rows += start
+        seen = np.stack([lens.width - 1 - cols if mirrored else cols, rows], -1).astype(float)
+        return place(rows, cols, seen)
+
+    with ThreadPoolExecutor(STRIP_WORKERS) as pool:
+        parts = list(pool.map(strip, range(0, lens.height, at_once)))
+    joined = {f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Placement)}
+    if not len(joined["pixels"]):
         raise RegistrationError(
-            "No ray of the cube meets the surface.",
+            "No pixel of the cube meets the surface.",
             advice="Check that cube and photos show the same specimen between the same markers.",
         )
-    normals, rgb = caster.normals(hits)[keep], caster.colours(hits)[keep]
-    return _placed(
-        np.stack([rows[keep], cols[keep]], -1), hits.xyz[keep], normals, rgb, view, caster,
-        (hits.triangle[keep], hits.barycentric[keep]),
-    )  # fmt: skip
+    return Placement(**joined)
 
 
 def _placed(
