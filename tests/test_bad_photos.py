@@ -1,0 +1,237 @@
+"""Bad photos, markers and edges: a stable code, advice, the photos named."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scenes import SMALL, OnDisk, phantom_on_disk, read_corners, run_refused, specimap
+from test_acquisition import bomb
+
+from specimap.core.accuracy import compare_with_truth
+from specimap.core.cloud import Cloud
+from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline
+from specimap.core.report import Report
+
+
+def copied(photos: Path, folder: Path, *, stem: str = "", step: int = 1) -> Path:
+    """Copy every ``step``-th photo, its name led by ``stem``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in sorted(photos.iterdir())[::step]:
+        shutil.copy(path, folder / f"{stem}{path.name}")
+    return folder
+
+
+# ---- photos ---------------------------------------------------------------------------------------------
+
+
+def test_photos_that_are_not_there(small: OnDisk, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert run_refused(tmp_path / "none", small.header, out)["code"] == "not_found"
+    (tmp_path / "bare").mkdir()
+    assert run_refused(tmp_path / "bare", small.header, out)["code"] == "too_few_photos"
+    few = copied(small.photos, tmp_path / "few", step=3)
+    refusal = run_refused(few, small.header, out)
+    assert refusal["code"] == "too_few_photos"
+    assert "6" in str(refusal["message"])
+
+
+def test_photos_that_are_all_bad(small: OnDisk, tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for k in range(8):
+        (photos / f"{k}.jpg").write_text("a letter, not a photo")
+    refusal = run_refused(photos, small.header, tmp_path / "out")
+    assert refusal["code"] == "photo_unreadable"
+    assert "0.jpg" in str(refusal["message"])
+
+
+@pytest.fixture(scope="module")
+def other(tmp_path_factory: pytest.TempPathFactory) -> OnDisk:
+    """Another layout with the same ids."""
+    return phantom_on_disk(tmp_path_factory.mktemp("other"), replace(SMALL, seed=2, bands=2))
+
+
+@pytest.fixture(scope="module")
+def stranger(tmp_path_factory: pytest.TempPathFactory) -> OnDisk:
+    """Another layout with other ids."""
+    return phantom_on_disk(tmp_path_factory.mktemp("stranger"), replace(SMALL, seed=3, marker_ids=(10, 11, 12, 13)))
+
+
+@pytest.mark.parametrize("second", ["other", "stranger"])
+def test_two_scenes(small: OnDisk, second: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    scene: OnDisk = request.getfixturevalue(second)
+    photos = copied(small.photos, tmp_path / "photos", stem="a_", step=2)
+    copied(scene.photos, photos, stem="b_", step=2)
+    refusal = run_refused(photos, small.header, tmp_path / "out")
+    assert refusal["code"] == "photos_not_connected"
+    details = refusal["details"]
+    assert isinstance(details, dict)
+    names = details["photos"]
+    assert len({n[0] for n in names}) == 1  # those of one scene, wholly
+    assert len(names) == 6
+
+
+@pytest.fixture
+def shallow(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path, OnDisk], dict[str, str]]:
+    """Pose photos without measuring depth; returns the code of each photo that was refused, by name."""
+    from specimap.core.acquisition import AcquisitionSettings, photo_paths, read_photos
+    from specimap.core.reconstruct import colmap
+    from specimap.core.reconstruct.backend import ReconstructSettings, corners_in_photos, detect_in_photos
+
+    monkeypatch.setattr(colmap, "dense_depth", lambda *_, **__: [])
+
+    def pose(folder: Path, phantom: OnDisk) -> dict[str, str]:
+        photos, refused = read_photos(photo_paths(folder), AcquisitionSettings())
+        settings = ReconstructSettings()
+        found = detect_in_photos(photos, settings.dictionary, workers=2, progress=lambda _: None)
+        corners = corners_in_photos(photos, found, settings.dictionary)
+        answer = colmap.ColmapBackend().reconstruct(photos, corners, settings, workers=2, progress=lambda _: None)
+        # Those that are used lie where the truth says: distances between them, which need no common frame.
+        views = {Path(n).name: v for n, v in zip(phantom.truth.photo_names, phantom.truth.views, strict=True)}
+        posed = [(photos[p].name, pose.centre) for p, pose in zip(answer.photos, answer.poses, strict=True)]
+        known = [(views[n].cam_from_world.centre, c) for n, c in posed if n in views]
+        true, got = (np.stack(c) for c in zip(*known, strict=True))
+        gaps = [np.linalg.norm(c[:, None] - c[None], axis=-1) for c in (true, got)]
+        assert np.abs(gaps[0] - gaps[1]).max() < 0.05 * gaps[0].max()
+        return {r.name: r.code for r in [*refused, *answer.refused]}
+
+    return pose
+
+
+Pose = Callable[[Path, OnDisk], dict[str, str]]
+
+
+def test_a_few_foreign_and_bad_photos_are_refused_by_name(
+    small: OnDisk, other: OnDisk, stranger: OnDisk, shallow: Pose, tmp_path: Path
+) -> None:
+    photos = copied(small.photos, tmp_path / "photos")
+    shutil.copy(sorted(other.photos.iterdir())[3], photos / "other.jpg")
+    shutil.copy(sorted(stranger.photos.iterdir())[3], photos / "stranger.jpg")
+    shutil.copy(sorted(small.photos.iterdir())[0], photos / "again.jpg")
+    (photos / "letter.jpg").write_text("a letter")
+    whole = sorted(small.photos.iterdir())[1].read_bytes()
+    (photos / "cut.jpg").write_bytes(whole[: len(whole) // 3])
+    bomb(photos / "bomb.png")
+    refused = shallow(photos, small)
+    assert refused.pop("stranger.jpg") in ("photo_foreign", "photo_unlocated")
+    # Of two copies the one that comes first by name stays.
+    assert refused == {
+        "other.jpg": "photo_foreign", "view_000.jpg": "photo_duplicate", "letter.jpg": "photo_unreadable",
+        "cut.jpg": "photo_unreadable", "bomb.png": "photo_unreadable",
+    }  # fmt: skip
+
+
+def without_markers(path: Path, phantom: OnDisk) -> None:
+    """Paint grey over the cards in a photo."""
+    image = cv2.imread(str(path))
+    assert image is not None
+    names = [Path(n).name for n in phantom.truth.photo_names]
+    view = phantom.truth.views[names.index(path.name)]
+    for corners in phantom.truth.marker_corners:
+        middle = corners.mean(0)
+        card = np.round(view.project(middle + 1.3 * (corners - middle))).astype(np.int32)
+        cv2.fillConvexPoly(image, card, (120, 120, 120))
+    cv2.imwrite(str(path), image, [cv2.IMWRITE_JPEG_QUALITY, 95])
+
+
+def test_photos_without_a_marker_are_located_by_features(small: OnDisk, shallow: Pose, tmp_path: Path) -> None:
+    photos = copied(small.photos, tmp_path / "photos")
+    for name in ("view_003.jpg", "view_011.jpg"):
+        without_markers(photos / name, small)
+    refused = shallow(photos, small)  # checks poses against truth
+    assert len(refused) <= 1
+    assert set(refused.values()) <= {"photo_unlocated"}
+
+
+def test_a_blurred_photo_is_located_or_refused_by_name(small: OnDisk, shallow: Pose, tmp_path: Path) -> None:
+    photos = copied(small.photos, tmp_path / "photos")
+    image = cv2.imread(str(photos / "view_005.jpg"))
+    assert image is not None
+    cv2.imwrite(str(photos / "view_005.jpg"), cv2.GaussianBlur(image, (0, 0), 9))
+    assert shallow(photos, small) in ({}, {"view_005.jpg": "photo_blurred"})
+
+
+def test_photos_held_both_ways_are_all_used(small: OnDisk, shallow: Pose, tmp_path: Path) -> None:
+    """Portrait and landscape of one camera; the phantom's square photos are cut to show it."""
+    photos = copied(small.photos, tmp_path / "photos")
+    for k, path in enumerate(sorted(photos.iterdir())):
+        image = cv2.imread(str(path))
+        assert image is not None
+        cut = image[24:360]  # 336 x 384
+        cv2.imwrite(str(path), np.ascontiguousarray(np.rot90(cut)) if k % 3 == 0 else cut)
+    assert shallow(photos, small) == {}
+
+
+# ---- markers --------------------------------------------------------------------------------------------
+
+
+def test_no_marker_anywhere(small: OnDisk, tmp_path: Path) -> None:
+    photos = copied(small.photos, tmp_path / "photos")
+    for path in photos.iterdir():
+        without_markers(path, small)
+    assert run_refused(photos, small.header, tmp_path / "out")["code"] == "no_markers_found"
+
+
+@pytest.mark.parametrize("given", ["DICT_5X5_50", "DICT_6X6_1000", "DICT_APRILTAG_16h5", "DICT_7X7_1000"])
+def test_markers_of_another_dictionary(small: OnDisk, tmp_path: Path, given: str) -> None:
+    refusal = run_refused(small.photos, small.header, tmp_path / "out", "--dictionary", given)
+    assert refusal["code"] == "marker_dictionary_wrong"
+    assert "DICT_4X4_1000" in str(refusal["advice"])
+
+
+def test_a_layout_of_one_marker_is_refused_at_the_cube(tmp_path: Path) -> None:
+    phantom = phantom_on_disk(tmp_path, replace(SMALL, marker_ids=(5,), bands=4))
+    refusal = run_refused(phantom.photos, phantom.header, tmp_path / "out")
+    assert refusal["code"] == "markers_missing_in_cube"
+
+
+def test_other_layouts_work(tmp_path: Path) -> None:
+    """Nine markers of another dictionary and edge."""
+    settings = replace(SMALL, marker_ids=tuple(range(20, 29)), dictionary="DICT_6X6_250", edge_mm=10.0, bands=4,
+                       photo_size=512)  # fmt: skip
+    phantom = phantom_on_disk(tmp_path, settings)
+    pipeline = PipelineSettings()
+    pipeline = replace(
+        pipeline,
+        reconstruct=replace(pipeline.reconstruct, dictionary="DICT_6X6_250", edge_mm=10.0),
+        adjust=replace(pipeline.adjust, edge_mm=10.0),
+    )
+    report = run_pipeline(Inputs(phantom.photos, phantom.header), tmp_path / "out", pipeline)
+    ids, corners = read_corners(tmp_path / "out")
+    assert len(ids) >= 8
+    cloud = Cloud.open(tmp_path / "out" / "cloud.zarr")
+    true_corners = phantom.truth.marker_corners[[list(settings.marker_ids).index(i) for i in ids]]
+    against = compare_with_truth(
+        cloud.hsi_pixel, cloud.xyz, corners, true_corners, phantom.truth.hsi_xyz.astype(float),
+        phantom.truth.hsi_class == 1,
+    )  # fmt: skip
+    assert 0.01 < against.median < 0.4
+    assert abs(against.scale) < 0.005
+    assert report.edge_length_mm.mean == pytest.approx(10, rel=0.01)
+
+
+# ---- scale ----------------------------------------------------------------------------------------------
+
+
+def test_a_wrong_edge_is_warned_of(small: OnDisk, tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    from PIL import ExifTags, Image
+
+    for path in small.photos.iterdir():
+        with Image.open(path) as image:
+            exif = Image.Exif()
+            exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.SubjectDistance] = 0.15
+            image.save(photos / path.name, quality=95, exif=exif)
+    answer = specimap(
+        "run", "--photos", photos, "--cube", small.header, "--out", tmp_path / "out", "--edge-mm", 68, "--json"
+    )
+    assert answer.status == 0
+    report = Report.model_validate(answer.events[-1]["report"])
+    assert {"scale_implausible", "scale_contradicts_exif"} <= {w.code for w in report.warnings}
