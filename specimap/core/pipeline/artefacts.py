@@ -25,6 +25,8 @@ from specimap.core.solver import Observations
 from specimap.core.surface import Mesh
 
 DEPTH_STEPS = 65534
+IMAGES = ("depth_", "colour_", "confidence_", "turn_", "greys")
+"""Arrays of stage 1 that stage 2 alone needs: hundreds of megabytes."""
 FORMAT = 1
 """Counts up when what a stage saves, or how a stage computes it, changes: older artefacts are then not reused."""
 
@@ -79,12 +81,15 @@ class Store:
             if old != target:
                 remove(old)
 
-    def load(self, stage: str, key: str) -> tuple[dict[str, Any], Any] | None:
-        """Arrays and meta of an artefact; None where there is none of that key, or it does not read."""
+    def load(self, stage: str, key: str, passed_over: tuple[str, ...] = ()) -> tuple[dict[str, Any], Any] | None:
+        """Arrays and meta of an artefact; None where there is none of that key, or it does not read.
+
+        Arrays whose names start with one of ``passed_over`` stay on the disk.
+        """
         path = self.path(stage, key)
         try:
             with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-                arrays = {name: archive[name] for name in archive.files}
+                arrays = {name: archive[name] for name in archive.files if not name.startswith(passed_over)}
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
             return None
         meta = json.loads(str(arrays.pop("meta")))
@@ -128,14 +133,14 @@ def save_stage1(store: Store, key: str, stage: Stage1) -> None:
     store.save("reconstruct", key, arrays, meta)
 
 
-def load_stage1(store: Store, key: str) -> Stage1 | None:
-    """The artefact of :func:`save_stage1`."""
-    found = store.load("reconstruct", key)
+def load_stage1(store: Store, key: str, *, with_depth: bool = True) -> Stage1 | None:
+    """The artefact of :func:`save_stage1`; without depth maps and images where only what follows needs it."""
+    found = store.load("reconstruct", key, () if with_depth else IMAGES)
     if found is None:
         return None
     arrays, meta = found
     maps = []
-    for k, m in enumerate(meta["maps"]):
+    for k, m in enumerate(meta["maps"] if with_depth else []):
         packed = arrays[f"depth_{k}"]
         depth = np.where(packed > 0, (packed.astype(np.float32) - 1) * m["step"] + m["low"], 0).astype(np.float32)
         lens = Intrinsics(**m["lens"])
@@ -154,7 +159,7 @@ def load_stage1(store: Store, key: str) -> Stage1 | None:
     return Stage1(
         reconstruction, CornersInPhotos(seen, tuple(meta["marker_ids"])), tuple(meta["names"]),
         tuple(Refusal(**x) for x in meta["refused"]), meta["subject_mm"],
-        tuple(arrays["greys"]),
+        tuple(arrays.get("greys", ())),
     )  # fmt: skip
 
 

@@ -113,15 +113,17 @@ def run_pipeline(
             digests = {p.name: d for p, d in zip(paths, pool.map(_digest, paths), strict=True)}
         key1 = key_of(
             "reconstruct",
-            {"photos": digests, "acquisition": asdict(settings.acquisition), "s": asdict(settings.reconstruct)},
-        )
-        stage1 = reconstruct_stage(paths, settings, outputs.store, key1, clock, workers)
+            {"photos": digests, "acquisition": asdict(settings.acquisition), "s": asdict(settings.reconstruct),
+             "edge_mm": settings.adjust.edge_mm},
+        )  # fmt: skip
         key2 = key_of(
             "adjust",
             {"before": key1, "s": asdict(settings.adjust), "surface": asdict(settings.surface),
              "refine": asdict(settings.refine)},
         )  # fmt: skip
-        stage2 = adjust_stage(stage1, settings, outputs.store, key2, clock, workers)
+        kept = load_stage2(outputs.store, key2)
+        stage1 = reconstruct_stage(paths, settings, outputs.store, key1, clock, workers, with_depth=kept is None)
+        stage2 = adjust_stage(stage1, settings, outputs.store, key2, clock, workers, kept)
         # A cube of a gigabyte comes next; the depth maps have done their work.
         stage1 = stage1.without_depth()
         key4 = key_of(
@@ -171,10 +173,18 @@ def _finished(outputs: Outputs, key: str) -> Report | None:
 
 
 def reconstruct_stage(
-    paths: list[Path], settings: PipelineSettings, store: Store, key: str, clock: Clock, workers: int
+    paths: list[Path],
+    settings: PipelineSettings,
+    store: Store,
+    key: str,
+    clock: Clock,
+    workers: int,
+    *,
+    with_depth: bool = True,
 ) -> Stage1:
+    """Stage 1, or what an earlier run left of it, then ``with_depth`` maps or without."""
     with clock.stage("reconstruct") as progress:
-        found = load_stage1(store, key)
+        found = load_stage1(store, key, with_depth=with_depth)
         if found is not None:
             clock.reused.append("reconstruct")
             return found
@@ -207,13 +217,19 @@ def _subject_mm(photos: list[Photo]) -> float | None:
 
 
 def adjust_stage(
-    stage1: Stage1, settings: PipelineSettings, store: Store, key: str, clock: Clock, workers: int
+    stage1: Stage1,
+    settings: PipelineSettings,
+    store: Store,
+    key: str,
+    clock: Clock,
+    workers: int,
+    kept: Stage2 | None = None,
 ) -> Stage2:
+    """Stage 2, or ``kept``, what an earlier run left of it."""
     with clock.stage("adjust") as progress:
-        found = load_stage2(store, key)
-        if found is not None:
+        if kept is not None:
             clock.reused.append("adjust")
-            return found
+            return kept
         r = stage1.reconstruction
         seen = stage1.corners.seen
         place = {photo: k for k, photo in enumerate(r.photos)}
