@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import json
+from collections.abc import Callable
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -36,7 +37,7 @@ from specimap.core.register.register import (
     place_by_camera,
     place_by_homography,
 )
-from specimap.core.render import extent_of, render_grid
+from specimap.core.render import Grid, extent_of, render_grid
 from specimap.core.report import (
     Coverage,
     CubeCameraFigures,
@@ -77,81 +78,8 @@ def register_and_write(
         progress(0.3)
         fine = render_grid(caster, low, high, settings.render.r_pc_mm)
     with clock.stage("register") as progress:
-        found = find_markers(cube, settings.reconstruct.dictionary, adjusted.marker_ids)
-        progress(0.1)
-        seen = _corners_in_cube(found, adjusted, cube.cols)
-        flat = seen.flat()
-        camera = solve_camera(*flat, cube.rows, cube.cols)
-        homography = fit_homography(flat[0], flat[1], coarse, settings.register.ransac_px)
-        by_camera = settings.register.method == "camera"
-        chosen = (
-            place_by_camera(camera.view, caster, found.mirrored)
-            if by_camera
-            else place_by_homography(homography, coarse, fine, camera.view, caster, found.mirrored)
-        )
-        pixels = _as_seen(chosen, found.mirrored, cube.cols)
-        other = (
-            homography_xyz(homography, coarse, fine, pixels)
-            if by_camera
-            else caster.cast(camera.view.cam_from_world.centre, camera.view.world_rays(pixels)).xyz
-        )
-        apart = np.linalg.norm(chosen.xyz - other, axis=1).astype(np.float32)
-        progress(0.3)
-        points = cloud_points(
-            chosen,
-            caster,
-            stage2.sigma_mm.astype(np.float32),
-            adjusted.corners,
-            float(np.median(adjusted.sigma_corner_mm)),
-            _registration_mm(camera),
-            None if by_camera else apart,
-        )
-        progress(0.35)
-        figures = {
-            "camera": camera_figures(seen, camera.view, caster),
-            "homography": homography_figures(seen, coarse, fine, settings.register.ransac_px),
-        }
-        own = figures[settings.register.method]
-        report = Report(
-            specimap_version=__version__,
-            created=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-            method=settings.register.method,
-            backend=settings.reconstruct.backend,
-            adjustment=settings.adjust.form,
-            marker_ids=list(adjusted.marker_ids),
-            marker_ids_in_cube=list(found.marker_ids),
-            corner_2d_mm=own.corner_2d_mm,
-            corner_3d_mm=own.corner_3d_mm,
-            leave_one_marker_out_mm=own.leave_one_marker_out_mm,
-            methods=figures,
-            edge_length_mm=triangulated_edges(stage1, adjusted, settings.adjust.edge_mm),
-            corner_sigma_mm=float(np.median(adjusted.sigma_corner_mm)),
-            reprojection_px=Reprojection(before=adjusted.rms_before_px, after=adjusted.rms_after_px),
-            photos=Photos(
-                given=len(stage1.names) + len(stage1.refused),
-                used=[stage1.names[p] for p in stage1.reconstruction.photos],
-                refused=[Refused(**asdict(r)) for r in all_refused(stage1)],
-            ),
-            inliers=Inliers(
-                n=int(homography.inliers.sum()),
-                of=len(homography.inliers),
-                threshold_px=settings.register.ransac_px,
-                threshold_mm=settings.register.ransac_px * settings.render.r_reg_mm,
-            ),
-            coverage=Coverage(
-                between_markers=_coverage(camera.view, found.mirrored, adjusted.corners, chosen, cube),
-                points=len(points),
-                specimen_points=int(((points.flags & Flag.SPECIMEN) > 0).sum()),
-            ),
-            parallax_removed_mm=_parallax(apart[(points.flags & Flag.SPECIMEN) > 0]),
-            sigma_mm=_sigma(points),
-            cube_camera=_camera(camera, found, cube),
-            photo_focal_px=adjusted.lens.focal_px,
-            seconds=dict(clock.seconds),
-            reused_stages=list(clock.reused),
-            warnings=[Remark(code=c, message=m) for c, m in [*remarks, *_remarks(stage1, adjusted, found)]],
-            settings=settings.as_dict(),
-            inputs=inputs,
+        points, report = _register(
+            stage1, stage2, cube, settings, caster, (coarse, fine), remarks, inputs, clock, progress
         )
         with staged(outputs) as aside:
             write_mesh_ply(aside.mesh, mesh)
@@ -170,6 +98,99 @@ def register_and_write(
     return report
 
 
+def _register(
+    stage1: Stage1,
+    stage2: Stage2,
+    cube: Cube,
+    settings: PipelineSettings,
+    caster: RayCaster,
+    grids: tuple[Grid, Grid],
+    remarks: list[tuple[str, str]],
+    inputs: dict[str, str],
+    clock: Clock,
+    progress: Callable[[float], None],
+) -> tuple[CloudPoints, Report]:
+    """Stage 4 up to the writing; what it needs on the way is gone by then."""
+    adjusted, (coarse, fine) = stage2.adjusted, grids
+    found = find_markers(cube, settings.reconstruct.dictionary, adjusted.marker_ids)
+    progress(0.1)
+    seen = _corners_in_cube(found, adjusted, cube.cols)
+    flat = seen.flat()
+    camera = solve_camera(*flat, cube.rows, cube.cols)
+    homography = fit_homography(flat[0], flat[1], coarse, settings.register.ransac_px)
+    by_camera = settings.register.method == "camera"
+    chosen = (
+        place_by_camera(camera.view, caster, found.mirrored)
+        if by_camera
+        else place_by_homography(homography, coarse, fine, camera.view, caster, found.mirrored)
+    )
+    pixels = _as_seen(chosen, found.mirrored, cube.cols)
+    other = (
+        homography_xyz(homography, coarse, fine, pixels)
+        if by_camera
+        else caster.cast(camera.view.cam_from_world.centre, camera.view.world_rays(pixels)).xyz
+    )
+    apart = np.linalg.norm(chosen.xyz - other, axis=1).astype(np.float32)
+    progress(0.3)
+    points = cloud_points(
+        chosen,
+        caster,
+        stage2.sigma_mm.astype(np.float32),
+        adjusted.corners,
+        float(np.median(adjusted.sigma_corner_mm)),
+        camera.sideways_mm,
+        None if by_camera else apart,
+    )
+    progress(0.35)
+    figures = {
+        "camera": camera_figures(seen, camera.view, caster),
+        "homography": homography_figures(seen, coarse, fine, settings.register.ransac_px),
+    }
+    own = figures[settings.register.method]
+    report = Report(
+        specimap_version=__version__,
+        created=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        method=settings.register.method,
+        backend=settings.reconstruct.backend,
+        adjustment=settings.adjust.form,
+        marker_ids=list(adjusted.marker_ids),
+        marker_ids_in_cube=list(found.marker_ids),
+        corner_2d_mm=own.corner_2d_mm,
+        corner_3d_mm=own.corner_3d_mm,
+        leave_one_marker_out_mm=own.leave_one_marker_out_mm,
+        methods=figures,
+        edge_length_mm=triangulated_edges(stage1, adjusted, settings.adjust.edge_mm),
+        corner_sigma_mm=float(np.median(adjusted.sigma_corner_mm)),
+        reprojection_px=Reprojection(before=adjusted.rms_before_px, after=adjusted.rms_after_px),
+        photos=Photos(
+            given=len(stage1.names) + len(stage1.refused),
+            used=[stage1.names[p] for p in stage1.reconstruction.photos],
+            refused=[Refused(**asdict(r)) for r in all_refused(stage1)],
+        ),
+        inliers=Inliers(
+            n=int(homography.inliers.sum()),
+            of=len(homography.inliers),
+            threshold_px=settings.register.ransac_px,
+            threshold_mm=settings.register.ransac_px * settings.render.r_reg_mm,
+        ),
+        coverage=Coverage(
+            between_markers=_coverage(camera.view, found.mirrored, adjusted.corners, chosen, cube),
+            points=len(points),
+            specimen_points=int(((points.flags & Flag.SPECIMEN) > 0).sum()),
+        ),
+        parallax_removed_mm=_parallax(apart[(points.flags & Flag.SPECIMEN) > 0]),
+        sigma_mm=_sigma(points),
+        cube_camera=_camera(camera, found, cube),
+        photo_focal_px=adjusted.lens.focal_px,
+        seconds=dict(clock.seconds),
+        reused_stages=list(clock.reused),
+        warnings=[Remark(code=c, message=m) for c, m in [*remarks, *_remarks(stage1, adjusted, found)]],
+        settings=settings.as_dict(),
+        inputs=inputs,
+    )
+    return points, report
+
+
 def _corners_in_cube(found: CubeMarkers, adjusted: Adjusted, cols: int) -> CornersInCube:
     rows = [adjusted.marker_ids.index(i) for i in found.marker_ids]
     pixels = found.corners_px.copy()
@@ -178,12 +199,6 @@ def _corners_in_cube(found: CubeMarkers, adjusted: Adjusted, cols: int) -> Corne
     return CornersInCube(
         found.marker_ids, adjusted.corners[rows], pixels, np.hypot(found.sigma_px, CUBE_CORNER_FLOOR_PX)
     )
-
-
-def _registration_mm(camera: CubeCamera) -> float:
-    """Sideways standard deviation of a registered pixel: the corners' misfit, shared by all of them."""
-    view = camera.view
-    return camera.rms_px * float(view.cam_from_world.centre[2]) / view.intrinsics.focal_px
 
 
 def triangulated_edges(stage1: Stage1, adjusted: Adjusted, expected: float) -> EdgeLength:

@@ -25,13 +25,15 @@ class DepthSettings:
     """Dense matching.
 
     ``angle_deg``: least, best and widest angle between two photos' directions to the scene. ``wide_angle_deg``:
-    the widest angle where a photo has no nearer neighbour. ``pairs_per_photo``: partners of each photo.
+    the widest angle where a photo has no nearer neighbour. ``pairs_per_photo``: partners of each photo; one
+    fewer from ``many_photos`` on, since every place is then seen by more photos anyway.
     ``block_px``: matching window. ``uniqueness``: per cent by which the best match must win.
     """
 
     angle_deg: tuple[float, float, float] = (4.0, 14.0, 30.0)
     wide_angle_deg: float = 42.0
     pairs_per_photo: int = 3
+    many_photos: int = 32
     block_px: int = 3
     uniqueness: int = 8
 
@@ -105,6 +107,7 @@ def choose_pairs(poses: tuple[Pose, ...], target: Floats, settings: DepthSetting
     angle = np.degrees(np.arccos(np.clip(sight @ sight.T, -1, 1)))
     least, best, widest = settings.angle_deg
     pairs = []
+    partners = settings.pairs_per_photo - (len(poses) >= settings.many_photos)
     for i in range(len(poses)):
         ratio = np.maximum(distance / distance[i], distance[i] / distance)
         badness = np.abs(np.log(np.maximum(angle[i], 0.1) / best)) + 2 * np.log(ratio)
@@ -118,7 +121,7 @@ def choose_pairs(poses: tuple[Pose, ...], target: Floats, settings: DepthSetting
             # Partners from different sides see around different corners: skip one close to a chosen one.
             if all(angle[j, k] > 0.6 * best for k in chosen):
                 chosen.append(int(j))
-            if len(chosen) == settings.pairs_per_photo:
+            if len(chosen) >= max(partners, 1):
                 break
         pairs += [(i, j) for j in chosen]
     return pairs

@@ -35,6 +35,11 @@ class CubeCamera:
     focal_sd: float
     covariance: Floats
 
+    @property
+    def sideways_mm(self) -> float:
+        """Sideways standard deviation of a registered pixel: the corners' misfit, shared by all of them."""
+        return self.rms_px * float(self.view.cam_from_world.centre[2]) / self.view.intrinsics.focal_px
+
 
 def solve_camera(
     corners: Floats, corners_px: Floats, sigma_px: Floats, rows: int, cols: int, *, focal_px: float | None = None
