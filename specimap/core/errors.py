@@ -104,12 +104,6 @@ class MarkerGeometryError(SpecimapError, ValueError):
     code = "marker_geometry_unsolvable"
 
 
-class EdgeLengthError(SpecimapError, ValueError):
-    """The given marker edge contradicts what else is known of the scale."""
-
-    code = "marker_edge_wrong"
-
-
 # ---- cube ---------------------------------------------------------------------------------------------
 
 
@@ -141,12 +135,6 @@ class CubeContentError(SpecimapError, ValueError):
     """The cube reads, but holds nothing usable: no finite or varying values, or a reference that does not fit."""
 
     code = "cube_content_invalid"
-
-
-class CubeMirroredError(SpecimapError, ValueError):
-    """The markers in the cube decode only in a mirror."""
-
-    code = "cube_mirrored"
 
 
 class RegistrationError(SpecimapError, ValueError):
@@ -217,12 +205,10 @@ HTTP_STATUS: dict[type[SpecimapError], int] = {
     CubeContentError: 422,
     CubeFormatError: 415,
     CubeHeaderError: 422,
-    CubeMirroredError: 422,
     CubeNotFoundError: 404,
     CubeTruncatedError: 422,
     DepthNotFoundError: 422,
     DuplicateMarkersError: 422,
-    EdgeLengthError: 422,
     MarkerGeometryError: 422,
     MarkersMissingInCubeError: 422,
     NoMarkersFoundError: 422,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from specimap.core.acquisition import Photo, Refusal
 from specimap.core.errors import DuplicateMarkersError, NoMarkersFoundError, WrongDictionaryError
 from specimap.core.fiducials import Detection, detect_markers, fitting_dictionaries
-from specimap.core.geometry import Floats, Intrinsics, Pose
+from specimap.core.geometry import Intrinsics, Pose
 from specimap.core.reconstruct.depth import DepthMap, DepthSettings
 from specimap.core.solver import Observations
 
@@ -154,9 +155,7 @@ def detect_in_photos(
     photos: list[Photo], dictionary: str, *, workers: int, progress: Progress
 ) -> list[list[Detection]]:
     """Markers of every photo, in order; several photos at a time."""
-    from concurrent.futures import ThreadPoolExecutor
-
-    expected = 4
+    expected = 4  # the published layout; a photo that shows fewer is searched a second time, enlarged
     found: list[list[Detection]] = []
     with ThreadPoolExecutor(workers) as pool:
         for one in pool.map(lambda p: detect_markers(p.grey, dictionary, expected=expected), photos):
@@ -167,12 +166,5 @@ def detect_in_photos(
 
 def sparse_points(maps: list[DepthMap], poses: tuple[Pose, ...], per_map: int = 200) -> NDArray[np.float32]:
     """A thin, even sample of the depth maps' points (N, 3), for the report and for checks."""
-    parts: list[Floats] = []
-    for depth_map in maps:
-        rows, cols = np.nonzero(depth_map.depth)
-        step = max(1, len(rows) // per_map)
-        r, c = rows[::step], cols[::step]
-        view = depth_map.view(poses[depth_map.photo])
-        cam = view.intrinsics.rays(np.stack([c, r], -1).astype(float)) * depth_map.depth[r, c][:, None]
-        parts.append(view.cam_from_world.inverse().apply(cam))
+    parts = [m.points(poses[m.photo], per_map) for m in maps]
     return np.concatenate(parts or [np.zeros((0, 3))]).astype(np.float32)

@@ -48,10 +48,7 @@ def find_content(
         )
         if found is None:
             return np.zeros((0, 3), np.int64)
-        rows, cols = np.nonzero(found.depth)
-        view = found.view(poses[i])
-        cam = view.intrinsics.rays(np.stack([cols, rows], -1).astype(float)) * found.depth[rows, cols, None]
-        cells = np.floor((view.cam_from_world.inverse().apply(cam) - volume.low) / cell).astype(np.int64)
+        cells = np.floor((found.points(poses[i]) - volume.low) / cell).astype(np.int64)
         kept, count = np.unique(cells, axis=0, return_counts=True)
         return kept[count >= 3]
 

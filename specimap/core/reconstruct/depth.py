@@ -26,8 +26,8 @@ class DepthSettings:
 
     ``angle_deg``: least, best and widest angle between two photos' directions to the scene. ``wide_angle_deg``:
     the widest angle where a photo has no nearer neighbour. ``pairs_per_photo``: partners of each photo; one
-    fewer from ``many_photos`` on, since every place is then seen by more photos anyway.
-    ``block_px``: matching window. ``uniqueness``: per cent by which the best match must win.
+    fewer from ``many_photos`` on, since every place is then seen by more photos anyway. ``block_px``: matching
+    window. ``uniqueness``: per cent by which the best match must win.
     """
 
     angle_deg: tuple[float, float, float] = (4.0, 14.0, 30.0)
@@ -63,8 +63,7 @@ class DepthMap:
 
     ``photo``: index of the posed photo. ``turn`` (3, 3): ``virtual_from_photo`` rotation. ``intrinsics``: of the
     virtual, undistorted camera. ``depth`` (H, W) along z in mm, 0 where unknown. ``confidence`` (H, W) uint8,
-    255 for sure.
-    ``colour`` (H, W, 3) sRGB uint8 seen there.
+    255 for sure. ``colour`` (H, W, 3) sRGB uint8 seen there.
     """
 
     photo: int
@@ -77,6 +76,14 @@ class DepthMap:
     def view(self, pose: Pose) -> View:
         """The virtual camera, given the photo's (refined) ``cam_from_world``."""
         return View(self.intrinsics, Pose(self.turn @ pose.R, self.turn @ pose.t))
+
+    def points(self, pose: Pose, most: int | None = None) -> Floats:
+        """Places (N, 3) mm of the known depths in the world of ``pose``, evenly thinned to about ``most``."""
+        rows, cols = np.nonzero(self.depth)
+        step = max(1, len(rows) // most) if most else 1
+        rows, cols = rows[::step], cols[::step]
+        cam = self.intrinsics.rays(np.stack([cols, rows], -1).astype(float)) * self.depth[rows, cols, None]
+        return self.view(pose).cam_from_world.inverse().apply(cam)
 
 
 def volume_over(corners: Floats, *, height_share: float = 0.35, below_mm: float = 2.0) -> Volume:
