@@ -21,12 +21,13 @@ PACKAGE = ROOT / "specimap"
 
 MAY_IMPORT = {
     "core": {"core"},
-    "workers": {"core", "workers"},
-    "service": {"core", "service", "workers"},
-    "cli": {"core", "cli", "service", "workers"},
+    "infra": {"core", "infra"},
+    "workers": {"core", "infra", "workers"},
+    "service": {"core", "infra", "service"},
+    "cli": {"core", "infra", "cli", "service", "workers"},
 }
 HEAVY = ("cv2", "open3d", "pycolmap", "embreex", "scipy")
-LIGHT = ("specimap.core.cloud", "specimap.core.report", "specimap.core.errors", "specimap.cli.app")
+LIGHT = ("specimap.core.cloud", "specimap.core.report", "specimap.core.errors", "specimap.cli.app", "specimap.service.app")
 
 
 def imported(source: str) -> set[str]:

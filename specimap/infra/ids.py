@@ -1,0 +1,16 @@
+"""Identifiers: sortable by time, safe in paths and URLs, and telling nothing about a patient."""
+
+from __future__ import annotations
+
+import re
+from typing import Literal
+
+from ulid import ULID
+
+Kind = Literal["acq", "file", "up", "job", "cloud", "key", "exp", "evt", "att", "dlv"]
+PATTERN = re.compile(r"^[a-z]{2,5}_[0-9a-hjkmnp-tv-z]{26}$")
+
+
+def new_id(kind: Kind) -> str:
+    """``job_01k…``: a kind and a ULID in lower case."""
+    return f"{kind}_{str(ULID()).lower()}"

@@ -1,0 +1,1 @@
+"""Alembic's scripts; ``specimap.infra.migrate`` runs them."""

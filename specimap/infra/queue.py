@@ -1,0 +1,47 @@
+"""The job queue's names and its client: DBOS, durable workflows in the same database as the tables."""
+
+from __future__ import annotations
+
+import sqlalchemy as sa
+from dbos import DBOSClient, WorkflowSerializationFormat
+from dbos import DBOSPortableJSONSerializer as JsonSerializer
+
+JOBS = "specimap-jobs"
+EXPORTS = "specimap-exports"
+RUN_JOB = "run_job"
+"""Workflow with one argument, the job's id, which is also the workflow's."""
+MAKE_EXPORT = "make_export"
+"""Workflow with one argument, the export's id, which is also the workflow's."""
+APPLICATION = "specimap"
+APPLICATION_VERSION = "1"
+"""Fixed: by default it is a hash of the code, and a new version would never take up an old one's jobs."""
+POLL_SECONDS = 0.25
+
+
+def queue_client(engine: sa.Engine) -> DBOSClient:
+    """A client that enqueues and cancels; it runs nothing."""
+    return DBOSClient(
+        system_database_engine=engine,
+        serializer=JsonSerializer(),
+        application_name=APPLICATION,
+        retry_connection_errors=False,
+        lazy=True,
+    )
+
+
+def enqueue(client: DBOSClient, connection: sa.Connection, queue: str, workflow: str, id: str, priority: int) -> None:
+    """Enqueue within the caller's transaction, so that a row and its workflow are there together or not at all."""
+    client.enqueue_in_transaction(
+        connection,
+        {
+            "workflow_name": workflow,
+            "queue_name": queue,
+            "workflow_id": id,
+            "workflow_id_reuse_policy": "reject",
+            "app_version": APPLICATION_VERSION,
+            # Unset would run before priority 1.
+            "priority": priority,
+            "serialization_type": WorkflowSerializationFormat.PORTABLE,
+        },
+        id,
+    )

@@ -1,0 +1,1 @@
+"""The HTTP API: uploads, jobs, results, keys. Pulls no 3D vision package."""

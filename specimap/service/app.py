@@ -1,0 +1,88 @@
+"""The FastAPI app, made from settings."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from fastapi import FastAPI
+from starlette.middleware.cors import CORSMiddleware
+
+from specimap import __version__
+from specimap.infra.settings import ServiceSettings
+from specimap.service import problems
+from specimap.service.auth import Keyring
+from specimap.service.context import AppContext
+from specimap.service.middleware import Observed
+from specimap.service.routers import (  # fmt: skip
+    acquisitions,
+    clouds,
+    exports,
+    files,
+    health,
+    jobs,
+    keys,
+    labels,
+    previews,
+    spectra,
+    uploads,
+    zarr,
+)
+
+DESCRIPTION = """\
+Photos and one hyperspectral cube of an excised specimen to a metric 3D point cloud in which every point carries its
+spectrum. Every call but `/healthz` and `/readyz` takes a key: `Authorization: Bearer spk_…`. Errors are
+`application/problem+json` with a stable code and an advice. Within `/v1` the contract only grows.
+"""
+
+
+def create_app(settings: ServiceSettings) -> FastAPI:
+    """An app on the database and storage that the settings name; the database has been migrated.
+
+    Raises:
+        SettingsError, OutputNotWritableError: the storage or its folder cannot be made.
+    """
+    context = AppContext.open(settings)
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        yield
+        context.close()
+
+    app = FastAPI(
+        title="Specimap",
+        version=__version__,
+        description=DESCRIPTION,
+        license_info={"name": "Apache-2.0", "identifier": "Apache-2.0"},
+        responses=problems.RESPONSES,
+        redirect_slashes=False,
+        lifespan=lifespan,
+        separate_input_output_schemas=False,
+    )
+    app.state.context = context
+    app.state.keyring = Keyring(context.database, settings.rate_per_minute, settings.quota_bytes)
+    problems.install(app)
+    for module in (
+        health, keys, acquisitions, files, uploads, jobs, clouds, zarr, spectra, previews, labels, exports,
+    ):  # fmt: skip
+        app.include_router(module.router)
+    uploads.mount(app, context)
+    if settings.cors_origins:
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=settings.cors_origins,
+            allow_methods=["*"],
+            allow_headers=["*"],
+            expose_headers=EXPOSED,
+            max_age=600,
+        )
+    app.add_middleware(Observed, metrics=context.metrics)
+    return app
+
+
+EXPOSED = [
+    "Accept-Ranges", "Content-Length", "Content-Range", "ETag", "Location", "Retry-After", "X-Correlation-Id",
+    "Tus-Resumable", "Tus-Version", "Tus-Extension", "Tus-Max-Size", "Upload-Offset", "Upload-Length",
+    "Upload-Expires", "Upload-Metadata", "X-Specimap-Total",
+]  # fmt: skip
+"""Headers that a page of another origin may read."""

@@ -1,0 +1,97 @@
+"""A running service for tests: a real server on a free port, a real database, a folder as storage."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import httpx
+import pytest
+import uvicorn
+from fastapi import FastAPI
+
+from specimap.infra.database import Database
+from specimap.infra.migrate import migrate
+from specimap.infra.settings import ServiceSettings, load_settings
+from specimap.infra.storage import Storage
+from specimap.service.app import create_app
+from specimap.service.auth import new_key
+
+ALL_SCOPES = ("upload", "read", "label", "admin")
+
+
+@dataclass
+class Running:
+    """A service that answers at ``url``."""
+
+    url: str
+    settings: ServiceSettings
+    app: FastAPI
+    clients: list[httpx.Client] = field(default_factory=list)
+
+    @property
+    def database(self) -> Database:
+        """The app's own database object."""
+        database: Database = self.app.state.context.database
+        return database
+
+    @property
+    def storage(self) -> Storage:
+        """The app's own storage object."""
+        storage: Storage = self.app.state.context.storage
+        return storage
+
+    def key(self, scopes: Sequence[str] = ALL_SCOPES, **options: int) -> str:
+        """A new key."""
+        row, key = new_key("test", scopes, **options)  # type: ignore[arg-type]
+        with self.database.session() as session:
+            session.add(row)
+        return key
+
+    def client(self, scopes: Sequence[str] = ALL_SCOPES, **options: int) -> httpx.Client:
+        """A client with a new key of these scopes; closed with the service."""
+        headers = {"Authorization": f"Bearer {self.key(scopes, **options)}"}
+        client = httpx.Client(base_url=self.url, headers=headers, timeout=60, trust_env=False)
+        self.clients.append(client)
+        return client
+
+
+@contextmanager
+def serving(folder: Path, **given: object) -> Iterator[Running]:
+    """Serve from a folder until the block ends; ``given`` are settings."""
+    settings = load_settings(**{"data_dir": folder, "log_level": "warning", "min_free_bytes": 0, **given})
+    database = Database.open(settings.database)
+    migrate(database)
+    database.close()
+    app = create_app(settings)
+    server = uvicorn.Server(
+        uvicorn.Config(app, host="127.0.0.1", port=0, log_config=None, access_log=False, ws="none", lifespan="on")
+    )
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    deadline = time.monotonic() + 20
+    while not server.started:
+        assert thread.is_alive()
+        assert time.monotonic() < deadline, "the server did not start"
+        time.sleep(0.01)
+    port = server.servers[0].sockets[0].getsockname()[1]
+    running = Running(f"http://127.0.0.1:{port}", settings, app)
+    try:
+        yield running
+    finally:
+        for client in running.clients:
+            client.close()
+        server.should_exit = True
+        thread.join(timeout=20)
+        assert not thread.is_alive(), "the server did not stop"
+
+
+@pytest.fixture
+def service(tmp_path: Path) -> Iterator[Running]:
+    """A service of its own for one test."""
+    with serving(tmp_path / "service") as running:
+        yield running
