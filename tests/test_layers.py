@@ -27,7 +27,14 @@ MAY_IMPORT = {
     "cli": {"core", "infra", "cli", "service", "workers"},
 }
 HEAVY = ("cv2", "open3d", "pycolmap", "embreex", "scipy")
-LIGHT = ("specimap.core.cloud", "specimap.core.report", "specimap.core.errors", "specimap.cli.app", "specimap.service.app")
+LIGHT = (
+    "specimap.core.cloud",
+    "specimap.core.report",
+    "specimap.core.errors",
+    "specimap.cli.app",
+    "specimap.infra.migrate",
+    "specimap.service.app",
+)
 
 
 def imported(source: str) -> set[str]:
@@ -125,7 +132,7 @@ def test_lock_pins_what_the_project_asks_for() -> None:
     from packaging.utils import canonicalize_name
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    wanted = [*project["dependencies"], *(r for extra in ("pipeline", "dev")
+    wanted = [*project["dependencies"], *(r for extra in ("infra", "service", "pipeline", "dev")
                                           for r in project["optional-dependencies"][extra])]  # fmt: skip
     lines = [line for line in (ROOT / "requirements.lock").read_text("utf-8").splitlines() if line[:1] not in ("", "#")]
     pins = {canonicalize_name(pin.name): pin for pin in map(Requirement, lines)}
