@@ -8,14 +8,15 @@ import time
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from specimap.cli.options import settings_from
 from specimap.core.cube import open_cube
 from specimap.core.pipeline import Inputs, Outputs, run_pipeline
 from specimap.core.pipeline.artefacts import load_stage1, load_stage2
+from specimap.core.pipeline.clock import Clock
 from specimap.core.pipeline.finish import register_and_write
 from specimap.core.pipeline.outputs import prepare_folder
-from specimap.core.pipeline.run import Clock
-from specimap.core.pipeline.settings import PipelineSettings
+from specimap.core.pipeline.settings import PipelineSettings, settings_from
+from specimap.core.pipeline.stages import render_stage
+from specimap.core.raycast import RayCaster
 from specimap.core.report import Report
 
 
@@ -70,7 +71,9 @@ def _register(options: Namespace, steps: _Steps) -> Report:
     clock = Clock(steps, lambda: False)
     # Opening the cube belongs to the stage; its hash is taken while stage 1 works, as a run does.
     cube = open_cube(options.cube)
-    return register_and_write(stage1, stage2, cube, _settings(options), Outputs(options.out), clock, [], {})
+    settings, outputs, caster = _settings(options), Outputs(options.out), RayCaster(stage2.mesh)
+    grids = render_stage(stage2, caster, settings, outputs.store, "bench", clock)
+    return register_and_write(stage1, stage2, caster, grids, cube, settings, outputs, clock, [], {})
 
 
 def main() -> None:

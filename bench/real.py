@@ -9,11 +9,12 @@ from pathlib import Path
 
 from rich.console import Console
 
-from specimap.cli.options import settings_from
 from specimap.core.acquisition import photo_paths
+from specimap.core.pipeline.clock import Clock
 from specimap.core.pipeline.finish import triangulated_edges
 from specimap.core.pipeline.outputs import Outputs
-from specimap.core.pipeline.run import Clock, adjust_stage, reconstruct_stage
+from specimap.core.pipeline.settings import settings_from
+from specimap.core.pipeline.stages import adjust_stage, reconstruct_stage
 
 APPLE = "real_aruco_apple"
 EDGE_MM = 33.0

@@ -95,8 +95,8 @@ def run(
     listener: Listener = json_listener() if json_events else progress_listener()
     with _told(listener, debug), _stoppable() as stop_asked:
         # Imported late: `specimap --help` and `specimap info` need none of the 3D libraries.
-        from specimap.cli.options import settings_from
         from specimap.core.pipeline import Inputs, Outputs, run_pipeline
+        from specimap.core.pipeline.settings import settings_from
 
         settings = settings_from(
             edge_mm=edge_mm, dictionary=dictionary, method=method.value, adjustment=adjustment.value, r_pc=r_pc,

@@ -21,13 +21,15 @@ from specimap.core.files import atomic_path, remove
 from specimap.core.geometry import Floats, Intrinsics, Pose
 from specimap.core.reconstruct.backend import CornersInPhotos, Reconstruction
 from specimap.core.reconstruct.depth import DepthMap
+from specimap.core.render import Grid
 from specimap.core.solver import Observations
 from specimap.core.surface import Mesh
 
 DEPTH_STEPS = 65534
+GRIDS = ("coarse", "fine")
 IMAGES = ("depth_", "colour_", "confidence_", "turn_", "greys")
 """Arrays of stage 1 that stage 2 alone needs: hundreds of megabytes."""
-FORMAT = 1
+FORMAT = 2
 """Counts up when what a stage saves, or how a stage computes it, changes: older artefacts are then not reused."""
 
 
@@ -188,3 +190,33 @@ def load_stage2(store: Store, key: str) -> Stage2 | None:
         meta["scale"], meta["rms"][0], meta["rms"][1], meta["iterations"], meta["observations"],
     )  # fmt: skip
     return Stage2(adjusted, Mesh(x["vertices"], x["triangles"], x["normals"], x["colours"]), x["sigma"])
+
+
+def save_grids(store: Store, key: str, grids: tuple[Grid, Grid], mesh: Mesh) -> None:
+    """Coarse and fine grid of a mesh."""
+    arrays = {
+        f"{name}_{field}": getattr(grid, field)
+        for name, grid in zip(GRIDS, grids, strict=True)
+        for field in ("image", "xyz", "normal", "covered")
+    }
+    places = [[g.cell_mm, g.x_min, g.y_min] for g in grids]
+    store.save("render", key, arrays, {"mesh": _digest(mesh), "grids": places})
+
+
+def load_grids(store: Store, key: str, mesh: Mesh) -> tuple[Grid, Grid] | None:
+    """The artefact of :func:`save_grids`, if it is of this very mesh: a mesh made anew differs in its last digits."""
+    found = store.load("render", key)
+    if found is None or found[1]["mesh"] != _digest(mesh):
+        return None
+    x, meta = found
+    coarse, fine = (
+        Grid(
+            cell, x_min, y_min, x[f"{name}_image"], x[f"{name}_xyz"], x[f"{name}_normal"], x[f"{name}_covered"]
+        )
+        for name, (cell, x_min, y_min) in zip(GRIDS, meta["grids"], strict=True)
+    )
+    return coarse, fine
+
+
+def _digest(mesh: Mesh) -> str:
+    return hashlib.sha256(np.ascontiguousarray(mesh.vertices)).hexdigest()

@@ -1,4 +1,4 @@
-"""Stages 3 and 4, and what is written: mesh, corners, cloud, preview, report."""
+"""Stage 4, and what is written: mesh, corners, cloud, preview, report."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ from specimap.core.geometry import Floats, Pose, View
 from specimap.core.layout import edge_lengths
 from specimap.core.meshfile import write_mesh_ply
 from specimap.core.pipeline.artefacts import Stage1, Stage2
+from specimap.core.pipeline.clock import Clock
 from specimap.core.pipeline.outputs import Outputs, staged
-from specimap.core.pipeline.run import Clock, all_refused
 from specimap.core.pipeline.settings import PipelineSettings
+from specimap.core.pipeline.stages import all_refused
 from specimap.core.points import cloud_points
 from specimap.core.preview import write_preview
 from specimap.core.raycast import RayCaster
@@ -37,7 +38,7 @@ from specimap.core.register.register import (
     place_by_camera,
     place_by_homography,
 )
-from specimap.core.render import Grid, extent_of, render_grid
+from specimap.core.render import Grid
 from specimap.core.report import (
     Coverage,
     CubeCameraFigures,
@@ -52,7 +53,6 @@ from specimap.core.report import (
     SigmaFigures,
 )
 
-GRID_MARGIN_MM = 4.0
 CUBE_CORNER_FLOOR_PX = 0.03
 SUBJECT_DISAGREES = 2.0
 PLAUSIBLE_DISTANCE_MM = (50.0, 1200.0)
@@ -62,6 +62,8 @@ PLAUSIBLE_DISTANCE_MM = (50.0, 1200.0)
 def register_and_write(
     stage1: Stage1,
     stage2: Stage2,
+    caster: RayCaster,
+    grids: tuple[Grid, Grid],
     cube: Cube,
     settings: PipelineSettings,
     outputs: Outputs,
@@ -69,17 +71,11 @@ def register_and_write(
     remarks: list[tuple[str, str]],
     inputs: dict[str, str],
 ) -> Report:
-    """Render the grids, register the cube, write all results; the report comes last."""
+    """Register the cube, write all results; the report comes last."""
     adjusted, mesh = stage2.adjusted, stage2.mesh
-    with clock.stage("render") as progress:
-        caster = RayCaster(mesh)
-        low, high = extent_of(adjusted.corners, GRID_MARGIN_MM)
-        coarse = render_grid(caster, low, high, settings.render.r_reg_mm)
-        progress(0.3)
-        fine = render_grid(caster, low, high, settings.render.r_pc_mm)
     with clock.stage("register") as progress:
         points, report = _register(
-            stage1, stage2, cube, settings, caster, (coarse, fine), remarks, inputs, clock, progress
+            stage1, stage2, cube, settings, caster, grids, remarks, inputs, clock, progress
         )
         with staged(outputs) as aside:
             write_mesh_ply(aside.mesh, mesh)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
+from typing import cast
 
 from specimap.core.acquisition import AcquisitionSettings
-from specimap.core.adjust import AdjustSettings
+from specimap.core.adjust import AdjustSettings, Form
 from specimap.core.errors import SettingsError
 from specimap.core.fiducials import dictionary_named
 from specimap.core.reconstruct.backend import ReconstructSettings
 from specimap.core.refine import RefineSettings
-from specimap.core.register.register import RegisterSettings
+from specimap.core.register.register import Method, RegisterSettings
 from specimap.core.render import RenderSettings
 from specimap.core.surface import SurfaceSettings
 
@@ -63,3 +64,30 @@ class PipelineSettings:
     def as_dict(self) -> dict[str, object]:
         """JSON-ready."""
         return asdict(self)
+
+
+def settings_from(
+    *,
+    edge_mm: float,
+    dictionary: str,
+    method: str,
+    adjustment: str,
+    r_pc: float,
+    r_reg: float,
+    backend: str,
+    working_px: int,
+) -> PipelineSettings:
+    """Settings of a run from the few that a person chooses, checked.
+
+    Raises:
+        SettingsError, UnknownDictionaryError: see :meth:`PipelineSettings.check`.
+    """
+    settings = PipelineSettings(
+        acquisition=AcquisitionSettings(working_px=working_px),
+        reconstruct=ReconstructSettings(dictionary=dictionary, edge_mm=edge_mm, backend=backend),
+        adjust=AdjustSettings(form=cast(Form, adjustment), edge_mm=edge_mm),
+        render=RenderSettings(r_reg_mm=r_reg, r_pc_mm=r_pc),
+        register=RegisterSettings(method=cast(Method, method)),
+    )
+    settings.check()
+    return settings

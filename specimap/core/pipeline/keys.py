@@ -1,0 +1,37 @@
+"""The key of each stage's artefact: a hash of everything that goes into it, the stages before included."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+
+from specimap.core.pipeline.artefacts import key_of
+from specimap.core.pipeline.settings import PipelineSettings
+
+
+def surface_keys(photos: Mapping[str, str], settings: PipelineSettings) -> dict[str, str]:
+    """Keys of the stages that the cube has no part in; ``photos``: names with the hashes of the files."""
+    reconstruct = key_of(
+        "reconstruct",
+        {"photos": dict(photos), "acquisition": asdict(settings.acquisition), "s": asdict(settings.reconstruct),
+         "edge_mm": settings.adjust.edge_mm},
+    )  # fmt: skip
+    adjust = key_of(
+        "adjust",
+        {"before": reconstruct, "s": asdict(settings.adjust), "surface": asdict(settings.surface),
+         "refine": asdict(settings.refine)},
+    )  # fmt: skip
+    render = key_of("render", {"before": adjust, "s": asdict(settings.render)})
+    return {"reconstruct": reconstruct, "adjust": adjust, "render": render}
+
+
+def register_key(render: str, cube: str, settings: PipelineSettings) -> str:
+    """Key of stage 4; ``cube``: a hash of the cube and its references."""
+    return key_of("register", {"before": render, "cube": cube, "s": asdict(settings.register)})
+
+
+def digest_of(photos: Mapping[str, str]) -> str:
+    """One hash for all photos."""
+    return hashlib.sha256(json.dumps(dict(photos), sort_keys=True).encode()).hexdigest()

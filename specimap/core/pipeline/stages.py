@@ -1,0 +1,145 @@
+"""The first three stages: load what an earlier run left, else call the stage, save, time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from specimap.core.acquisition import Photo, Refusal, read_photos
+from specimap.core.adjust import adjust
+from specimap.core.native import preload
+from specimap.core.pipeline.artefacts import (
+    Stage1,
+    Stage2,
+    Store,
+    load_grids,
+    load_stage1,
+    save_grids,
+    save_stage1,
+    save_stage2,
+)
+from specimap.core.pipeline.clock import Clock
+from specimap.core.pipeline.settings import PipelineSettings
+from specimap.core.raycast import RayCaster
+from specimap.core.reconstruct.backend import ReconstructionBackend, corners_in_photos, detect_in_photos
+from specimap.core.reconstruct.depth import volume_over
+from specimap.core.refine import pixel_footprint_mm, refine_mesh
+from specimap.core.render import Grid, extent_of, render_grid
+from specimap.core.surface import fuse
+from specimap.core.uncertainty import vertex_sigma
+
+VOXEL_PIXELS = 2.0
+"""Edge of a fusion voxel in photo pixels on the specimen: finer ones hold noise, coarser ones lose bumps."""
+GRID_MARGIN_MM = 4.0
+
+
+def backend_named(name: str) -> ReconstructionBackend:
+    """The backend of that name; settings have been checked."""
+    from specimap.core.reconstruct.colmap import ColmapBackend
+
+    return {"colmap": ColmapBackend}[name]()
+
+
+def reconstruct_stage(
+    paths: list[Path],
+    settings: PipelineSettings,
+    store: Store,
+    key: str,
+    clock: Clock,
+    workers: int,
+    *,
+    with_depth: bool = True,
+) -> Stage1:
+    """Stage 1, or what an earlier run left of it, then ``with_depth`` maps or without."""
+    with clock.stage("reconstruct") as progress:
+        found = load_stage1(store, key, with_depth=with_depth)
+        if found is not None:
+            clock.reused.append("reconstruct")
+            return found
+        preload()
+        photos, refused = read_photos(
+            paths, settings.acquisition, workers=workers, progress=lambda s: progress(0.08 * s)
+        )
+        detections = detect_in_photos(
+            photos, settings.reconstruct.dictionary, workers=workers, progress=lambda s: progress(0.08 + 0.12 * s)
+        )
+        corners = corners_in_photos(photos, detections, settings.reconstruct.dictionary)
+        reconstruction = backend_named(settings.reconstruct.backend).reconstruct(
+            photos,
+            corners,
+            replace(settings.reconstruct, edge_mm=settings.adjust.edge_mm),
+            workers=workers,
+            progress=lambda s: progress(0.2 + 0.8 * s),
+        )
+        stage = Stage1(
+            reconstruction, corners, tuple(p.name for p in photos), tuple(refused), _subject_mm(photos),
+            tuple(photos[p].grey for p in reconstruction.photos),
+        )  # fmt: skip
+        save_stage1(store, key, stage)
+        return stage
+
+
+def _subject_mm(photos: list[Photo]) -> float | None:
+    stated = [p.subject_mm for p in photos if p.subject_mm]
+    return float(np.median(stated)) if stated else None
+
+
+def adjust_stage(
+    stage1: Stage1,
+    settings: PipelineSettings,
+    store: Store,
+    key: str,
+    clock: Clock,
+    workers: int,
+    kept: Stage2 | None = None,
+) -> Stage2:
+    """Stage 2, or ``kept``, what an earlier run left of it."""
+    with clock.stage("adjust") as progress:
+        if kept is not None:
+            clock.reused.append("adjust")
+            return kept
+        r = stage1.reconstruction
+        seen = stage1.corners.seen
+        place = {photo: k for k, photo in enumerate(r.photos)}
+        posed = seen.of(np.isin(seen.photo, r.photos))
+        posed = replace(posed, photo=np.array([place[int(p)] for p in posed.photo]))
+        adjusted = adjust(r.lens, r.poses, posed, stage1.corners.marker_ids, settings.adjust)
+        maps = tuple(replace(m, depth=m.depth * np.float32(adjusted.scale)) for m in r.maps)
+        target = volume_over(adjusted.corners).centre
+        voxel_mm = settings.surface.voxel_mm or VOXEL_PIXELS * pixel_footprint_mm(
+            adjusted.lens, adjusted.poses, target
+        )
+        fused = fuse(
+            list(maps), adjusted.poses, voxel_mm, settings.surface, progress=lambda s: progress(0.05 + 0.4 * s)
+        )
+        mesh = refine_mesh(
+            fused, list(stage1.greys), adjusted.lens, adjusted.poses, voxel_mm, settings.refine,
+            workers=workers, progress=lambda s: progress(0.45 + 0.5 * s),
+        )  # fmt: skip
+        stage = Stage2(adjusted, mesh, vertex_sigma(mesh, maps, adjusted.poses, workers=workers).astype(float))
+        save_stage2(store, key, stage)
+        return stage
+
+
+def render_stage(
+    stage2: Stage2, caster: RayCaster, settings: PipelineSettings, store: Store, key: str, clock: Clock
+) -> tuple[Grid, Grid]:
+    """Stage 3, or what an earlier run left of it: the coarse and the fine grid."""
+    with clock.stage("render") as progress:
+        found = load_grids(store, key, stage2.mesh)
+        if found is not None:
+            clock.reused.append("render")
+            return found
+        low, high = extent_of(stage2.adjusted.corners, GRID_MARGIN_MM)
+        coarse = render_grid(caster, low, high, settings.render.r_reg_mm)
+        progress(0.3)
+        fine = render_grid(caster, low, high, settings.render.r_pc_mm)
+        save_grids(store, key, (coarse, fine), stage2.mesh)
+        return coarse, fine
+
+
+def all_refused(stage1: Stage1) -> list[Refusal]:
+    """Photos refused while reading and while reconstructing."""
+    return [*stage1.refused, *stage1.reconstruction.refused]
