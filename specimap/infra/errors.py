@@ -78,6 +78,30 @@ class IdempotencyConflictError(SpecimapError, ValueError):
     code = "idempotency_conflict"
 
 
+class PreconditionFailedError(SpecimapError, ValueError):
+    """What is stored is not what the request's If-Match names."""
+
+    code = "precondition_failed"
+
+
+class RangeNotSatisfiableError(SpecimapError, ValueError):
+    """The byte range lies outside of the file; ``details['size']`` is the file's."""
+
+    code = "range_not_satisfiable"
+
+
+class NotAcceptableError(SpecimapError, ValueError):
+    """The answer does not exist in any media type that the request accepts; ``details['offered']`` lists them."""
+
+    code = "not_acceptable"
+
+
+class LostLeaseError(SpecimapError, RuntimeError):
+    """A worker wrote to a job that is not its own any more: cancelled, ended, or taken over by another."""
+
+    code = "lost_lease"
+
+
 class WorkerCrashedError(SpecimapError, RuntimeError):
     """The job's process died again and again; ``details['stage']`` says where."""
 
@@ -109,9 +133,13 @@ HTTP_STATUS: dict[type[SpecimapError], int] = {
     ForbiddenError: 403,
     IdempotencyConflictError: 409,
     JobConflictError: 409,
+    LostLeaseError: 409,
     MethodNotAllowedError: 405,
+    NotAcceptableError: 406,
     PayloadTooLargeError: 413,
+    PreconditionFailedError: 412,
     QuotaExceededError: 413,
+    RangeNotSatisfiableError: 416,
     RateLimitedError: 429,
     RequestInvalidError: 422,
     StageTimeoutError: 500,

@@ -237,6 +237,8 @@ class Export(Base):
     size: Mapped[int | None] = mapped_column(sa.BigInteger)
     error: Mapped[dict[str, Any] | None]
     executor: Mapped[str | None]
+    labels_hash: Mapped[str] = mapped_column(default="")
+    """Of the label layers in it, where it holds them: whether it is still what would be made now."""
     correlation_id: Mapped[str]
     created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now)
     created_by: Mapped[str]

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import sqlalchemy as sa
 from dbos import DBOSClient, WorkflowSerializationFormat
-from dbos import DBOSPortableJSONSerializer as JsonSerializer
+from dbos import DBOSPortableJSONSerializer
 
+JsonSerializer = DBOSPortableJSONSerializer
+"""Inputs and outputs are stored as JSON; a pickle in a database is a program."""
 JOBS = "specimap-jobs"
 EXPORTS = "specimap-exports"
 RUN_JOB = "run_job"

@@ -219,4 +219,4 @@ def load_grids(store: Store, key: str, mesh: Mesh) -> tuple[Grid, Grid] | None:
 
 
 def _digest(mesh: Mesh) -> str:
-    return hashlib.sha256(np.ascontiguousarray(mesh.vertices)).hexdigest()
+    return hashlib.sha256(mesh.vertices.tobytes()).hexdigest()

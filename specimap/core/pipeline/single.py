@@ -80,15 +80,17 @@ def _render(run: StageRun, clock: Clock) -> None:
 def _register(run: StageRun, clock: Clock) -> None:
     from specimap.core.pipeline.artefacts import load_grids
     from specimap.core.pipeline.finish import register_and_write
+    from specimap.core.pipeline.stages import render_stage
     from specimap.core.raycast import RayCaster
 
     outputs, cube = Outputs(run.out), _cube(run)
     stage1, stage2 = _stage1(run, with_depth=False), _stage2(run)
-    grids = load_grids(outputs.store, run.keys["render"], stage2.mesh)
-    if grids is None:
-        raise _absent("render")
+    caster = RayCaster(stage2.mesh)
+    store, key = outputs.store, run.keys["render"]
+    # Rendered again only where the grids are of another run of stage 2.
+    grids = load_grids(store, key, stage2.mesh) or render_stage(stage2, caster, run.settings, store, key, clock)
     register_and_write(
-        stage1, stage2, RayCaster(stage2.mesh), grids, cube, run.settings, outputs, clock, _remarks(cube),
+        stage1, stage2, caster, grids, cube, run.settings, outputs, clock, _remarks(cube),
         {"key": run.keys["register"], **run.hashes},
     )  # fmt: skip
 

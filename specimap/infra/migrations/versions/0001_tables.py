@@ -246,6 +246,7 @@ def upgrade() -> None:
         sa.Column("size", sa.BigInteger(), nullable=True),
         sa.Column("error", sa.JSON(), nullable=True),
         sa.Column("executor", sa.String(), nullable=True),
+        sa.Column("labels_hash", sa.String(), nullable=False),
         sa.Column("correlation_id", sa.String(), nullable=False),
         sa.Column("created_at", UtcDateTime(), nullable=False),
         sa.Column("created_by", sa.String(), nullable=False),

@@ -1,0 +1,107 @@
+"""Artefacts of finished stages in the common storage: found again by key, one for each stage of an acquisition."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import sqlalchemy as sa
+
+from specimap.core.errors import NotFoundError
+from specimap.core.pipeline.artefacts import Store
+from specimap.infra.database import Database
+from specimap.infra.errors import LostLeaseError
+from specimap.infra.ids import new_id
+from specimap.infra.jobs import locked
+from specimap.infra.models import Artefact
+from specimap.infra.storage import Storage
+
+SAVED = ("reconstruct", "adjust", "render")
+"""Stages that leave an artefact; the last one leaves the result."""
+
+
+@dataclass(frozen=True)
+class Artefacts:
+    """The artefacts that one job reads and writes."""
+
+    database: Database
+    storage: Storage
+    acquisition_id: str
+
+    def seconds(self, stage: str, key: str) -> float | None:
+        """How long the stage took when it left an artefact of that key; None where there is none."""
+        row = self._row(stage, key)
+        if row is None:
+            return None
+        try:
+            self.storage.stat(row.storage_key)
+        except NotFoundError:
+            return None
+        return row.seconds
+
+    def fetch(self, stage: str, key: str, folder: Path) -> bool:
+        """Bring an artefact into a work folder; false where there is none."""
+        target = Store(folder / "stages").path(stage, key)
+        if target.exists():
+            return True
+        row = self._row(stage, key)
+        if row is None:
+            return False
+        try:
+            self.storage.fetch(row.storage_key, target)
+        except NotFoundError:
+            return False
+        return True
+
+    def keep(self, stage: str, key: str, folder: Path, seconds: float, job_id: str, executor: str) -> None:
+        """Store what a stage left in a work folder, in place of what other settings left before.
+
+        Raises:
+            LostLeaseError: the job is not this executor's any more; nothing has changed then.
+        """
+        source = Store(folder / "stages").path(stage, key)
+        size = source.stat().st_size
+        storage_key = f"acquisitions/{self.acquisition_id}/stages/{new_id('att')}.npz"
+        copy = source.with_name(f".{source.name}.copy.tmp")
+        try:
+            os.link(source, copy)
+        except OSError:
+            shutil.copyfile(source, copy)
+        self.storage.put_file(storage_key, copy)
+        try:
+            with self.database.session() as session:
+                job = locked(session, job_id)
+                if job is None or job.executor != executor or job.state != "running":
+                    raise LostLeaseError(f"Job {job_id} is not {executor}'s any more.", advice="Stop working on it.")
+                of_stage = sa.and_(Artefact.acquisition_id == self.acquisition_id, Artefact.stage == stage)
+                old = list(session.scalars(sa.select(Artefact.storage_key).where(of_stage)))
+                session.execute(sa.delete(Artefact).where(of_stage))
+                session.add(
+                    Artefact(
+                        id=new_id("att"),
+                        acquisition_id=self.acquisition_id,
+                        stage=stage,
+                        key=key,
+                        storage_key=storage_key,
+                        size=size,
+                        seconds=seconds,
+                    )
+                )
+                # Starts count from the last finished stage: whoever gets on is not poisoned.
+                job.starts = 1
+                job.seconds = {**job.seconds, stage: round(seconds, 3)}
+        except BaseException:
+            self.storage.delete(storage_key)
+            raise
+        for key_before in old:
+            self.storage.delete(key_before)
+
+    def _row(self, stage: str, key: str) -> Artefact | None:
+        with self.database.session() as session:
+            return session.scalar(
+                sa.select(Artefact).where(
+                    Artefact.acquisition_id == self.acquisition_id, Artefact.stage == stage, Artefact.key == key
+                )
+            )

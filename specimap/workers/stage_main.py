@@ -1,0 +1,94 @@
+"""A stage's own process: waits for one stage on standard input, runs it, tells how it goes on standard output.
+
+A process for each stage keeps the worker's heartbeats off the interpreter lock, gives memory back for certain, and
+can be killed at any time. It loads the libraries before the stage comes, so that a stage finds it warm.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import resource
+import signal
+import sys
+from pathlib import Path
+from typing import Any, TextIO
+
+PR_SET_PDEATHSIG = 1
+
+
+def die_with_parent() -> None:
+    """End this process when its parent ends, however that happens."""
+    ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() == 1:  # it ended before the line above
+        os._exit(1)
+
+
+def _say(out: TextIO, **event: object) -> None:
+    out.write(json.dumps(event) + "\n")
+    out.flush()
+
+
+def _load() -> None:
+    """Import what the stages need: most of a second."""
+    import specimap.core.pipeline.finish
+    import specimap.core.pipeline.single
+    import specimap.core.pipeline.stages  # noqa: F401
+    from specimap.core.native import preload
+
+    preload()
+
+
+def _run(spec: dict[str, Any], out: TextIO) -> None:
+    from specimap.core.pipeline import Inputs, settings_from
+    from specimap.core.pipeline.single import StageRun, run_stage
+
+    paths = {name: Path(path) for name, path in spec["inputs"].items()}
+    run = StageRun(
+        spec["stage"], Inputs(**paths), Path(spec["out"]), settings_from(**spec["settings"]), spec["keys"],
+        spec["seconds"], spec["reused"], spec["hashes"], spec["workers"],
+    )  # fmt: skip
+    seconds = run_stage(run, progress=lambda stage, share: _say(out, event="progress", stage=stage, share=share))
+    _say(out, event="done", seconds=seconds)
+
+
+def main() -> None:
+    """Serve one stage."""
+    die_with_parent()
+    # Libraries that print would break the lines that the worker reads.
+    out = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    limit = int(sys.argv[1]) if len(sys.argv) > 1 else 0
+    if limit:
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    _load()
+    _say(out, event="ready")
+    line = sys.stdin.readline()
+    if not line:
+        return
+    from specimap.core.errors import SpecimapError, StorageFullError
+
+    try:
+        _run(json.loads(line), out)
+    except SpecimapError as error:
+        _say(out, event="failed", error=error.as_dict())
+    except MemoryError:
+        refused = SpecimapError(
+            "The stage needs more memory than it may take.",
+            advice="Raise SPECIMAP_STAGE_MEMORY_BYTES, or use fewer photos.",
+        )
+        _say(out, event="failed", error=refused.as_dict())
+    except OSError as error:
+        if error.errno != 28:
+            raise
+        full = StorageFullError("The disk filled up.", advice="Free space; finished stages are kept.")
+        _say(out, event="failed", error=full.as_dict())
+
+
+if __name__ == "__main__":
+    main()
+    # Native libraries' threads may hang in the interpreter's end; all results are on the disk.
+    sys.stdout.flush()
+    os._exit(0)
