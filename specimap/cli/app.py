@@ -16,6 +16,7 @@ from typing import Annotated
 import typer
 
 from specimap import __version__
+from specimap.cli.keys import keys_app
 from specimap.cli.progress import Listener, json_listener, progress_listener
 from specimap.core.errors import CancelledError, NotFoundError, SpecimapError
 
@@ -62,6 +63,13 @@ class Format(StrEnum):
     npz = "npz"
     envi = "envi"
     csv = "csv"
+
+
+class Kind(StrEnum):
+    """What a worker's slot is."""
+
+    cpu = "cpu"
+    gpu = "gpu"
 
 
 Debug = Annotated[
@@ -162,6 +170,46 @@ def export(
             typer.echo(f"Wrote {written}")
 
 
+@app.command()
+def serve(
+    worker: Annotated[bool, typer.Option(help="Run workers too; without, `specimap worker` runs them.")] = True,
+    debug: Debug = False,
+) -> None:
+    """Start the service: API and workers. Settings come from SPECIMAP_ variables; docs/settings.md lists them."""
+    with _told(progress_listener(), debug):
+        from specimap.cli.serve import serve as run_service
+
+        run_service(workers=worker, say=typer.echo)
+
+
+@app.command()
+def worker(
+    slots: Annotated[int | None, typer.Option(min=1, max=64, help="Jobs side by side.")] = None,
+    kind: Annotated[Kind, typer.Option(help="What the slots are.")] = Kind.cpu,
+    debug: Debug = False,
+) -> None:
+    """Start workers for a service that runs elsewhere, on the same database and storage."""
+    with _told(progress_listener(), debug):
+        from specimap.cli.serve import work
+
+        work(slots=slots, kind=kind.value)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the results and the demo's service.")] = Path("out/demo"),
+    samples: Annotated[Path, typer.Option(help="Folder of the sample that comes with the source.")] = Path("samples"),
+    stay: Annotated[bool, typer.Option(help="Let the service go on until Ctrl-C.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Run the sample through a service of its own: upload, job, progress, report, link."""
+    listener = progress_listener()
+    with _told(listener, debug):
+        from specimap.cli.demo import demo as run_demo
+
+        run_demo(samples, out, listener, stay=stay, say=typer.echo)
+
+
 @contextmanager
 def _stoppable() -> Iterator[Callable[[], bool]]:
     """Let SIGINT and SIGTERM ask for a stop at the next step; asked twice, the program ends at once."""
@@ -216,6 +264,9 @@ def _root(
     version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True)] = False,
 ) -> None:
     """Photos and one hyperspectral cube of an excised specimen to a metric 3D point cloud with spectra."""
+
+
+app.add_typer(keys_app, name="keys")
 
 
 def main() -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Protocol, Self
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, DownloadColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from specimap.cli.tables import print_report
 from specimap.core.errors import SpecimapError
@@ -41,6 +41,10 @@ class Listener(Protocol):
         """The run is whole."""
         ...
 
+    def report(self, report: Report) -> None:
+        """A run that another process did is whole."""
+        ...
+
     def refused(self, error: SpecimapError) -> None:
         """The run was refused or failed for a stated reason."""
         ...
@@ -70,6 +74,9 @@ class _Bars:
         if stage not in self._tasks:
             self._tasks[stage] = self._progress.add_task(STAGE_WORDS.get(stage, stage), total=1.0)
         self._progress.update(self._tasks[stage], completed=share)
+
+    def report(self, report: Report) -> None:
+        print_report(report)
 
     def finished(self, report: Report, outputs: Outputs) -> None:
         print_report(report)
@@ -107,6 +114,9 @@ class _Lines:
             self._last = step
             self._say(event="progress", stage=stage, share=round(share, 4))
 
+    def report(self, report: Report) -> None:
+        self._say(event="finished", report=report.model_dump(mode="json"))
+
     def finished(self, report: Report, outputs: Outputs) -> None:
         self._say(event="finished", out=str(outputs.folder), report=report.model_dump(mode="json"))
 
@@ -122,3 +132,27 @@ def progress_listener() -> Listener:
 def json_listener() -> Listener:
     """Lines for a program."""
     return _Lines()
+
+
+class UploadBar:
+    """A bar for files on their way."""
+
+    def __init__(self) -> None:
+        self._progress = Progress(
+            TextColumn("{task.description:<16}"), BarColumn(), DownloadColumn(), TimeElapsedColumn(),
+            console=Console(stderr=True),
+        )  # fmt: skip
+        self._task = self._progress.add_task("upload", total=None)
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def update(self, sent: int, size: int) -> None:
+        """``sent`` of ``size`` bytes have arrived."""
+        self._progress.update(self._task, completed=sent, total=size)

@@ -60,6 +60,24 @@ class UploadConflictError(SpecimapError, ValueError):
     code = "upload_conflict"
 
 
+class ChecksumMismatchError(SpecimapError, ValueError):
+    """What arrived does not have the checksum that came with it; nothing of it was kept."""
+
+    code = "checksum_mismatch"
+
+
+class UploadLockedError(SpecimapError, RuntimeError):
+    """Another request is writing to the same upload."""
+
+    code = "upload_locked"
+
+
+class UploadGoneError(SpecimapError, FileNotFoundError):
+    """The upload expired or was ended; ``details['state']`` says which."""
+
+    code = "upload_gone"
+
+
 class FileRefusedError(SpecimapError, ValueError):
     """A file has arrived but cannot be used; details hold the judgement."""
 
@@ -96,6 +114,12 @@ class NotAcceptableError(SpecimapError, ValueError):
     code = "not_acceptable"
 
 
+class MediaTypeError(SpecimapError, ValueError):
+    """The body is of a media type that the operation does not take; ``details['offered']`` lists those it does."""
+
+    code = "media_type_unsupported"
+
+
 class LostLeaseError(SpecimapError, RuntimeError):
     """A worker wrote to a job that is not its own any more: cancelled, ended, or taken over by another."""
 
@@ -128,12 +152,14 @@ class DatabaseUnavailableError(SpecimapError, RuntimeError):
 
 HTTP_STATUS: dict[type[SpecimapError], int] = {
     **core.HTTP_STATUS,
+    ChecksumMismatchError: 460,
     DatabaseUnavailableError: 503,
     FileRefusedError: 422,
     ForbiddenError: 403,
     IdempotencyConflictError: 409,
     JobConflictError: 409,
     LostLeaseError: 409,
+    MediaTypeError: 415,
     MethodNotAllowedError: 405,
     NotAcceptableError: 406,
     PayloadTooLargeError: 413,
@@ -146,7 +172,9 @@ HTTP_STATUS: dict[type[SpecimapError], int] = {
     StorageUnavailableError: 503,
     UnauthorizedError: 401,
     UploadConflictError: 409,
+    UploadGoneError: 410,
     UploadIncompleteError: 409,
+    UploadLockedError: 423,
     WorkerCrashedError: 500,
 }
 

@@ -8,7 +8,23 @@ from collections.abc import Iterable
 import sqlalchemy as sa
 from sqlalchemy.orm import Session, aliased
 
-from specimap.infra.models import LabelVersion
+from specimap.core.errors import NotFoundError
+from specimap.infra.models import CloudRow, LabelVersion
+
+
+def lock_cloud(session: Session, cloud_id: str) -> None:
+    """Keep others from changing what hangs on a cloud until the transaction ends.
+
+    Raises:
+        NotFoundError: there is no such cloud.
+    """
+    # A write that changes nothing, since SQLite locks by writes only.
+    held = session.execute(
+        sa.update(CloudRow).where(CloudRow.id == cloud_id).values(points=CloudRow.points).returning(CloudRow.id),
+        execution_options={"synchronize_session": False},
+    )
+    if held.first() is None:
+        raise NotFoundError(f"There is no cloud {cloud_id}.", advice="GET /v1/clouds lists all.")
 
 
 def current_labels(session: Session, cloud_id: str) -> list[LabelVersion]:

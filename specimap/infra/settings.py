@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Literal, Self
+from typing import Literal
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
 
 from specimap.core.errors import SettingsError
@@ -81,7 +81,7 @@ class ServiceSettings(BaseSettings):
     slots: int = Field(default=1, ge=1, le=64, description="Jobs that one `specimap worker` runs side by side.")
     heartbeat_seconds: float = Field(default=2.0, gt=0, description="How often a worker says that it is alive.")
     lease_seconds: float = Field(
-        default=10.0, gt=0, description="Silence after which a worker counts as dead and its jobs go to another."
+        default=10.0, gt=0, validate_default=True, description="Silence after which a worker counts as dead and its jobs go to another."
     )
     stage_seconds: float = Field(default=1800, gt=0, description="Longest time that one stage may take.")
     stage_memory_bytes: int = Field(
@@ -90,6 +90,8 @@ class ServiceSettings(BaseSettings):
     starts: int = Field(
         default=3, ge=1, description="Starts after which a job that keeps killing its process is failed."
     )
+
+    patience_seconds: float = Field(default=300, gt=0, description="How long a worker waits for a database or a storage that is away before it gives a job up.")
 
     webhook_hosts: list[str] = Field(
         default_factory=list,
@@ -132,11 +134,12 @@ class ServiceSettings(BaseSettings):
             raise ValueError("is a folder, or s3://BUCKET/PREFIX")
         return value
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        if self.lease_seconds < 2 * self.heartbeat_seconds:
-            raise ValueError("lease_seconds is at least twice heartbeat_seconds")
-        return self
+    @field_validator("lease_seconds")
+    @classmethod
+    def _longer_than_heartbeats(cls, value: float, info: ValidationInfo) -> float:
+        if value < 2 * info.data.get("heartbeat_seconds", 0):
+            raise ValueError("is at least twice SPECIMAP_HEARTBEAT_SECONDS")
+        return value
 
     @property
     def database(self) -> str:
@@ -182,7 +185,7 @@ def load_settings(**given: object) -> ServiceSettings:
         first = error.errors()[0]
         name = "_".join(str(part) for part in first["loc"][:1]) or "settings"
         raise SettingsError(
-            f"SPECIMAP_{name.upper()}: {first['msg']}.",
+            f"SPECIMAP_{name.upper()}: {first['msg'].removeprefix('Value error, ')}.",
             advice="docs/settings.md lists the settings and what they take.",
             setting=name,
         ) from error

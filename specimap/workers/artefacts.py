@@ -65,6 +65,7 @@ class Artefacts:
         size = source.stat().st_size
         storage_key = f"acquisitions/{self.acquisition_id}/stages/{new_id('att')}.npz"
         copy = source.with_name(f".{source.name}.copy.tmp")
+        copy.unlink(missing_ok=True)  # of an attempt that the storage refused
         try:
             os.link(source, copy)
         except OSError:

@@ -34,13 +34,6 @@ PROGRESS_SECONDS = 0.4
 """Least time between two progress events of a stage: a person sees no more, and each is a transaction."""
 RESULTS = ("cloud.zarr", "mesh.ply", "corners.json", "preview.png", "report.json")
 
-patiently = tenacity.retry(
-    retry=tenacity.retry_if_exception_type((DatabaseUnavailableError, StorageUnavailableError)),
-    wait=tenacity.wait_exponential_jitter(initial=0.2, max=5),
-    stop=tenacity.stop_after_delay(300),
-    reraise=True,
-)
-"""Try again for five minutes where the database or the storage is away."""
 
 
 class JobRun:
@@ -65,6 +58,12 @@ class JobRun:
         self.folder = work_folder(settings.scratch, job_id, executor)
         self._inputs, self._out = self.folder / "inputs", self.folder / "out"
         self._plan: Plan | None = None
+        self._patiently = tenacity.Retrying(
+            retry=tenacity.retry_if_exception_type((DatabaseUnavailableError, StorageUnavailableError)),
+            wait=tenacity.wait_exponential_jitter(initial=0.2, max=5),
+            stop=tenacity.stop_after_delay(settings.patience_seconds),
+            reraise=True,
+        )
 
     # ---- called by the workflow -----------------------------------------------------------------------
 
@@ -84,7 +83,7 @@ class JobRun:
                     return False
                 return True
 
-        return await asyncio.to_thread(patiently(take))
+        return await self._thread(take)
 
     async def stage(self, stage: str) -> dict[str, Any]:
         """Run a stage, or find what an earlier run left: ``seconds`` and ``reused``, or ``error``."""
@@ -105,6 +104,13 @@ class JobRun:
             if isinstance(error, DatabaseUnavailableError):
                 raise
             return {"stage": stage, "error": error.as_dict()}
+        except Exception as error:
+            logger().exception("unforeseen error", job=self.job_id, stage=stage)
+            unknown = SpecimapError(
+                f"An error that Specimap does not know, in stage {stage}: {type(error).__name__}.",
+                advice="Report it with the worker's log; finished stages are kept.",
+            )
+            return {"stage": stage, "error": unknown.as_dict()}
 
     async def finish(self, outcomes: list[dict[str, Any]]) -> str:
         """Write the end of the job: its cloud, or why it failed. Gives the state."""
@@ -273,7 +279,8 @@ class JobRun:
         await self._thread(write)
 
     async def _thread(self, call: Callable[..., Value], *args: object) -> Value:
-        return await asyncio.to_thread(patiently(call), *args)
+        """Call in a thread, and again where the database or the storage is away."""
+        return await asyncio.to_thread(self._patiently, call, *args)
 
 
 def work_folder(scratch: Path, job_id: str, executor: str) -> Path:

@@ -1,0 +1,224 @@
+"""Making the file of an export: in a process of its own, stored whole, the row written through a fence."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import sqlalchemy as sa
+
+from specimap.core.errors import CancelledError, NotFoundError, SpecimapError
+from specimap.core.export.formats import FileFormat, file_name
+from specimap.core.files import disk_errors, remove
+from specimap.infra.database import Database
+from specimap.infra.errors import DatabaseUnavailableError, StageTimeoutError, WorkerCrashedError
+from specimap.infra.labels import current_labels, fingerprint
+from specimap.infra.logs import logger
+from specimap.infra.models import CloudRow, Export
+from specimap.infra.settings import ServiceSettings
+from specimap.infra.storage import Storage
+from specimap.workers.export_main import REFUSED
+
+POLL_SECONDS = 0.1
+HELD_SECONDS = 2.0
+"""How often a running export's row is asked whether it still is this executor's."""
+
+
+def run_export(
+    export_id: str,
+    database: Database,
+    storage: Storage,
+    settings: ServiceSettings,
+    executor: str,
+    cancelled: Callable[[], bool] = lambda: False,
+) -> None:
+    """Make the file of an export and finish its row. Blocks; safe to repeat, also while another still works on it.
+
+    A row that is gone, or has ended, is left alone. A process that dies is started again, up to ``settings.starts``
+    times. What goes wrong is in the row, which is then ``failed``.
+
+    Raises:
+        CancelledError: ``cancelled`` came true; the row stays as it is, for whoever takes it up.
+        DatabaseUnavailableError: the row could not be read or written.
+    """
+    export = _claim(database, export_id, executor)
+    if export is None:
+        return
+    work = settings.scratch / f"{export_id}-{uuid4().hex[:8]}.tmp"
+    try:
+        format = FileFormat(export.format)
+        target = work / file_name(export.cloud_id, format)
+        with disk_errors(work):
+            work.mkdir(parents=True)
+        labels_hash = _fetch(database, storage, export.cloud_id, format, work)
+        _make(work, format, target, settings, lambda: _held(database, export_id, executor), cancelled)
+        key, size = f"exports/{export_id}/{target.name}", target.stat().st_size
+        storage.put_file(key, target)
+        done = {"state": "succeeded", "storage_key": key, "size": size, "error": None, "labels_hash": labels_hash}
+        if not _finish(database, export_id, executor, done) and _gone(database, export_id):
+            storage.delete(key)
+    except _LostError:
+        logger().warning("export lost", export=export_id)
+    except (CancelledError, DatabaseUnavailableError):
+        raise
+    except Exception as error:
+        failure = error if isinstance(error, SpecimapError) else SpecimapError(
+            "An error that Specimap does not know.", advice="Report it with the correlation id."
+        )  # fmt: skip
+        logger().error("export failed", export=export_id, code=failure.code, exc_info=error)
+        described = failure.as_dict()
+        # The path of a scratch folder says nothing to a client.
+        described["message"] = str(described["message"]).replace(f"{work}/", "")
+        _finish(database, export_id, executor, {"state": "failed", "error": described})
+    finally:
+        remove(work)
+
+
+class _LostError(Exception):
+    """The row is another executor's now, or gone."""
+
+
+# ---- the row ------------------------------------------------------------------------------------------
+
+
+def _claim(database: Database, export_id: str, executor: str) -> Export | None:
+    open_row = sa.and_(Export.id == export_id, Export.state.in_(["queued", "running"]))
+    with database.session() as session:
+        session.execute(sa.update(Export).where(open_row).values(state="running", executor=executor))
+        return session.scalar(sa.select(Export).where(open_row))
+
+
+def _held(database: Database, export_id: str, executor: str) -> bool:
+    with database.session() as session:
+        held = sa.select(Export.id).where(
+            Export.id == export_id, Export.executor == executor, Export.state == "running"
+        )
+        return session.scalar(held) is not None
+
+
+def _finish(database: Database, export_id: str, executor: str, values: dict[str, Any]) -> bool:
+    """Write the row's end; False where it is not this executor's any more."""
+    held = sa.and_(Export.id == export_id, Export.executor == executor, Export.state == "running")
+    with database.session() as session:
+        done = session.execute(sa.update(Export).where(held).values(**values).returning(Export.id))
+        return done.first() is not None
+
+
+def _gone(database: Database, export_id: str) -> bool:
+    with database.session() as session:
+        return session.get(Export, export_id) is None
+
+
+# ---- the file -----------------------------------------------------------------------------------------
+
+
+def _fetch(database: Database, storage: Storage, cloud_id: str, format: FileFormat, work: Path) -> str:
+    """Put what the format is made from into ``work``; the hash of the labels among it."""
+    with database.session() as session:
+        cloud = session.get(CloudRow, cloud_id)
+        labels = current_labels(session, cloud_id) if format is FileFormat.ZARR else []
+    if cloud is None:
+        raise _LostError
+    if format.startswith("mesh-"):
+        storage.fetch(f"{cloud.prefix}/mesh.ply", work / "mesh.ply")
+        return ""
+    storage.fetch(f"{cloud.prefix}/cloud.zarr", work / "cloud.zarr")
+    try:
+        for label in labels:
+            storage.fetch(label.storage_prefix, work / "cloud.zarr" / "labels" / label.name)
+    except NotFoundError:
+        # A layer was deleted since the rows were read. Where it was not, this ends with the error.
+        with database.session() as session:
+            if fingerprint(current_labels(session, cloud_id)) == fingerprint(labels):
+                raise
+        remove(work / "cloud.zarr")
+        return _fetch(database, storage, cloud_id, format, work)
+    return fingerprint(labels) if format is FileFormat.ZARR else ""
+
+
+def _make(
+    work: Path,
+    format: FileFormat,
+    target: Path,
+    settings: ServiceSettings,
+    held: Callable[[], bool],
+    cancelled: Callable[[], bool],
+) -> None:
+    """Run :mod:`specimap.workers.export_main`, again where it dies.
+
+    Raises:
+        SpecimapError: what it raised there, or WorkerCrashedError, StageTimeoutError, CancelledError.
+        _LostError: the row is another's.
+    """
+    status = 0
+    for _ in range(settings.starts):
+        status, answer = _run_once(work, format, target, settings, held, cancelled)
+        if status == 0:
+            return
+        if status == REFUSED:
+            error = json.loads(answer)
+            raise _RefusedError(error)
+        logger().warning("export process ended", format=format.value, status=status)
+    raise WorkerCrashedError(
+        f"The process that made the file ended with status {status}, {settings.starts} times.",
+        advice="A worker with more memory may help; the log says more.",
+        stage="export",
+        status=status,
+    )
+
+
+class _RefusedError(SpecimapError):
+    """An error of the process, as it described it."""
+
+    def __init__(self, error: dict[str, Any]) -> None:
+        super().__init__(error["message"], advice=error["advice"], **error["details"])
+        self.code = error["code"]  # type: ignore[misc]
+
+
+def _run_once(
+    work: Path,
+    format: FileFormat,
+    target: Path,
+    settings: ServiceSettings,
+    held: Callable[[], bool],
+    cancelled: Callable[[], bool],
+) -> tuple[int, str]:
+    command = [
+        sys.executable, "-m", "specimap.workers.export_main", str(work), format.value, str(target), str(os.getpid()),
+        str(settings.stage_memory_bytes),
+    ]  # fmt: skip
+    # A session of its own: a kill reaches whatever it starts, and the terminal's signals do not reach it.
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    start = asked = time.monotonic()
+    try:
+        while True:
+            with suppress(subprocess.TimeoutExpired):
+                answer, _ = process.communicate(timeout=POLL_SECONDS)
+                return process.returncode, answer
+            now = time.monotonic()
+            if cancelled():
+                raise CancelledError("The export was stopped.", advice="It is made when a worker takes it up again.")
+            if now - start > settings.stage_seconds:
+                raise StageTimeoutError(
+                    f"The export took longer than {settings.stage_seconds:.0f} s.",
+                    advice="Raise SPECIMAP_STAGE_SECONDS.",
+                    stage="export",
+                )
+            if now - asked > HELD_SECONDS:
+                asked = now
+                if not held():
+                    raise _LostError
+    finally:
+        if process.poll() is None:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.communicate()
