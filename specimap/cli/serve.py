@@ -38,7 +38,7 @@ def serve(*, workers: bool, say: Callable[[str], None]) -> None:
     database = Database.open(settings.database)
     try:
         migrate(database)
-        Storage.open(settings).check()
+        Storage.open(settings).check_at_start()
         key = _first_key(database)
     finally:
         database.close()
@@ -83,7 +83,7 @@ def work(*, slots: int | None, kind: str) -> None:
     database = Database.open(settings.database)
     try:
         migrate(database)
-        Storage.open(settings).check()
+        Storage.open(settings).check_at_start()
     finally:
         database.close()
     supervisor = Supervisor(slots or settings.slots, ("--kind", kind))

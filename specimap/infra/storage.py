@@ -22,6 +22,7 @@ from obstore.store import LocalStore, S3Store
 from specimap.core.errors import NotFoundError, OutputNotWritableError, SettingsError, StorageFullError
 from specimap.core.files import disk_errors, remove
 from specimap.infra.errors import StorageUnavailableError
+from specimap.infra.logs import logger
 from specimap.infra.settings import ServiceSettings
 
 PART = re.compile(r"^[A-Za-z0-9_=-][A-Za-z0-9._=-]*$")
@@ -239,6 +240,13 @@ class Storage:
             return None
         with _store_errors(str(self.folder)):
             return shutil.disk_usage(self.folder).free
+
+    def check_at_start(self) -> None:
+        """As :meth:`check`, but a full storage is warned of only: a service that starts can still be tidied up."""
+        try:
+            self.check()
+        except StorageFullError:
+            logger().warning("the storage is full: new uploads are refused, and jobs may fail")
 
     def check(self) -> None:
         """Raise StorageUnavailableError or StorageFullError where nothing can be written."""

@@ -65,7 +65,7 @@ def run_export(
         storage.put_file(key, target)
         done = {"state": "succeeded", "storage_key": key, "size": size, "error": None, "labels_hash": labels_hash}
         if not _finish(database, export_id, executor, done) and _gone(database, export_id):
-            storage.delete(key)
+            storage.delete(f"exports/{export_id}")
     except _LostError:
         logger().warning("export lost", export=export_id)
     except (CancelledError, DatabaseUnavailableError):

@@ -65,7 +65,7 @@ class Worker:
         Raises:
             DatabaseUnavailableError, StorageUnavailableError: nothing was started then.
         """
-        self._storage.check()
+        self._storage.check_at_start()
         self._sweep()
         self._register()
         self._configure()
