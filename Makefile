@@ -4,7 +4,7 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test lint bench clean
+.PHONY: help setup demo test lint bench bench-service check-images clean
 
 PYTHON ?= python3
 VENV := .venv
@@ -14,10 +14,12 @@ DEMO_OUT ?= out/demo
 
 help:
 	@echo "make setup   install into $(VENV), pinned versions"
-	@echo "make demo    set up, then run the pipeline on samples/ into $(DEMO_OUT)"
+	@echo "make demo    set up, then run samples/ through a service of its own into $(DEMO_OUT)"
 	@echo "make test    set up, then run the tests"
 	@echo "make lint    ruff and mypy"
 	@echo "make bench   time, memory and accuracy beside the published figures"
+	@echo "make bench-service   the same for the service, beside nginx"
+	@echo "make check-images    every install step of docker/ in a bare root folder (root, network)"
 	@echo "make clean   remove $(VENV) and out/"
 
 setup: $(STAMP)
@@ -29,16 +31,16 @@ $(RUN)/python:
 	@"$(PYTHON)" -m venv $(VENV) || { rm -rf $(VENV); \
 		echo "No virtual environment could be made. Run this, then make again: sudo apt install python3-venv" >&2; exit 1; }
 
-$(STAMP): pyproject.toml requirements.lock | $(RUN)/python
+$(STAMP): pyproject.toml client/pyproject.toml requirements.lock | $(RUN)/python
 	@$(RUN)/python -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 		echo "$(VENV) holds $$($(RUN)/python -V 2>&1); Specimap needs 3.11 or later. Remove $(VENV) and run make again." >&2; exit 1; }
 	@echo "Installing into $(VENV) (about 2.5 GB on disk; some minutes the first time)"
 	@$(RUN)/python -m pip install --quiet --disable-pip-version-check --requirement requirements.lock
-	@$(RUN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@$(RUN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable . --editable client
 	@touch $@
 
 demo: setup
-	$(RUN)/specimap run --photos samples/rgb --cube samples/hsi/hsi.hdr --out $(DEMO_OUT)
+	$(RUN)/specimap demo --out $(DEMO_OUT)
 
 test: setup
 	$(RUN)/python -m pytest
@@ -49,6 +51,12 @@ lint: setup
 
 bench: setup
 	$(RUN)/python -m bench
+
+bench-service: setup
+	$(RUN)/python -m bench.service
+
+check-images:
+	docker/check_images.sh
 
 clean:
 	rm -rf $(VENV) out

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-pytest_plugins = ("scenes", "service_scene")
+pytest_plugins = ("databases", "scenes", "service_scene", "client_scene")
 
 TEST_DATA_VARIABLE = "SPECIMAP_TEST_DATA"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -11,10 +12,12 @@ from pathlib import Path
 
 import httpx
 import pytest
+import structlog
 import uvicorn
 from fastapi import FastAPI
 
 from specimap.infra.database import Database
+from specimap.infra.logs import SHARED
 from specimap.infra.migrate import migrate
 from specimap.infra.settings import ServiceSettings, load_settings
 from specimap.infra.storage import Storage
@@ -63,7 +66,13 @@ class Running:
 @contextmanager
 def serving(folder: Path, **given: object) -> Iterator[Running]:
     """Serve from a folder until the block ends; ``given`` are settings."""
+    # Requests of a whole suite would bury what a failing test prints.
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING))
     settings = load_settings(**{"data_dir": folder, "log_level": "warning", "min_free_bytes": 0, **given})
+    if not structlog.is_configured():
+        # The library's own default draws every local variable of a traceback, which takes seconds.
+        plain = structlog.dev.ConsoleRenderer(exception_formatter=structlog.dev.plain_traceback)
+        structlog.configure(processors=[*SHARED, plain])
     database = Database.open(settings.database)
     migrate(database)
     database.close()

@@ -115,3 +115,12 @@ def test_pages_of_other_origins_may_call_only_where_allowed(tmp_path: Path) -> N
         assert "content-range" in allowed.headers["access-control-expose-headers"].lower()
         other = client.get("/healthz", headers={"Origin": "https://elsewhere.example"})
         assert "access-control-allow-origin" not in other.headers
+
+
+def test_endless_json_is_refused(service: Running) -> None:
+    client = service.client()
+    declared = client.post("/v1/keys", content=b" " * (17 << 20), headers={"Content-Type": "application/json"})
+    assert (declared.status_code, declared.json()["code"]) == (413, "payload_too_large")
+    pieces = (b" " * (1 << 20) for _ in range(17))
+    streamed = client.post("/v1/keys", content=pieces, headers={"Content-Type": "application/json"})
+    assert (streamed.status_code, streamed.json()["code"]) == (413, "payload_too_large")

@@ -59,7 +59,8 @@ class Supervisor:
                 thread.join(timeout=0.5)
 
     def _keep(self, slot: int) -> None:
-        command = [sys.executable, "-m", "specimap.workers", "--child", "--slot", str(slot), *self._options]
+        command = [sys.executable, "-m", "specimap.workers", "--slot", str(slot), *self._options]
+        command += ["--parent", str(os.getpid())]
         pause = FIRST_PAUSE
         while not self._stopping.is_set():
             started = time.monotonic()

@@ -152,6 +152,12 @@ class CloudDamagedError(SpecimapError, ValueError):
     code = "cloud_damaged"
 
 
+class LabelInvalidError(SpecimapError, ValueError):
+    """Labels do not fit the cloud: their number, a class that is not named, a probability outside 0..1."""
+
+    code = "label_invalid"
+
+
 # ---- the program --------------------------------------------------------------------------------------
 
 
@@ -209,6 +215,7 @@ HTTP_STATUS: dict[type[SpecimapError], int] = {
     CubeTruncatedError: 422,
     DepthNotFoundError: 422,
     DuplicateMarkersError: 422,
+    LabelInvalidError: 422,
     MarkerGeometryError: 422,
     MarkersMissingInCubeError: 422,
     NoMarkersFoundError: 422,

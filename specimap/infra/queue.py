@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import sqlalchemy as sa
-from dbos import DBOSClient, WorkflowSerializationFormat
-from dbos import DBOSPortableJSONSerializer
+from dbos import DBOSClient, DBOSPortableJSONSerializer, WorkflowSerializationFormat
 
 JsonSerializer = DBOSPortableJSONSerializer
 """Inputs and outputs are stored as JSON; a pickle in a database is a program."""

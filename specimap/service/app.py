@@ -12,6 +12,7 @@ from specimap import __version__
 from specimap.infra.settings import ServiceSettings
 from specimap.service import problems
 from specimap.service.auth import Keyring
+from specimap.service.bodies import JsonLimit
 from specimap.service.context import AppContext
 from specimap.service.middleware import Observed
 from specimap.service.routers import (  # fmt: skip
@@ -46,7 +47,8 @@ def create_app(settings: ServiceSettings) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        yield
+        async with uploads.sweeping(app, context):
+            yield
         context.close()
 
     app = FastAPI(
@@ -76,6 +78,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
             expose_headers=EXPOSED,
             max_age=600,
         )
+    app.add_middleware(JsonLimit)
     app.add_middleware(Observed, metrics=context.metrics)
     return app
 
@@ -83,6 +86,8 @@ def create_app(settings: ServiceSettings) -> FastAPI:
 EXPOSED = [
     "Accept-Ranges", "Content-Length", "Content-Range", "ETag", "Location", "Retry-After", "X-Correlation-Id",
     "Tus-Resumable", "Tus-Version", "Tus-Extension", "Tus-Max-Size", "Upload-Offset", "Upload-Length",
-    "Upload-Expires", "Upload-Metadata", "X-Specimap-Total",
+    "Upload-Expires", "Upload-Metadata", "X-Specimap-Total", "X-Specimap-Range", "X-Specimap-Extent-Mm",
+    "X-Specimap-Label-Version", "X-Specimap-Next-Offset", "Tus-Checksum-Algorithm", "Specimap-File",
+    "Specimap-Verdict",
 ]  # fmt: skip
 """Headers that a page of another origin may read."""

@@ -16,9 +16,11 @@ from specimap.infra.queue import queue_client
 from specimap.infra.settings import ServiceSettings
 from specimap.infra.storage import Storage
 from specimap.service.clouds import OpenClouds
+from specimap.service.job_events import JobEvents
 from specimap.service.judging import Judge
 from specimap.service.limits import RateLimiter
 from specimap.service.metrics import Metrics
+from specimap.service.picture_cache import PictureCache
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,8 @@ class AppContext:
     metrics: Metrics
     clouds: OpenClouds
     judge: Judge
+    events: JobEvents
+    pictures: PictureCache
 
     @classmethod
     def open(cls, settings: ServiceSettings) -> AppContext:
@@ -45,7 +49,7 @@ class AppContext:
         storage = Storage.open(settings)
         return cls(
             settings, database, storage, queue_client(database.engine), RateLimiter(), Metrics(database, storage),
-            OpenClouds(storage), Judge(settings),
+            OpenClouds(storage, database), Judge(settings), JobEvents(database), PictureCache(),
         )  # fmt: skip
 
     def close(self) -> None:
@@ -55,8 +59,8 @@ class AppContext:
         self.database.close()
 
 
-def app_context(request: Request) -> AppContext:
-    """The app's context."""
+async def app_context(request: Request) -> AppContext:
+    """The app's context; ``async`` so that no thread is taken for it."""
     context: AppContext = request.app.state.context
     return context
 

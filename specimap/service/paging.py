@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
+import datetime
 from typing import Annotated, Generic, TypeVar
 
 from fastapi import Query
-from pydantic import BaseModel, Field
+from pydantic import AfterValidator, AwareDatetime, BaseModel, Field
 
 Item = TypeVar("Item")
 Limit = Annotated[int, Query(ge=1, le=500, description="Most items of a page.")]
-After = Annotated[str | None, Query(max_length=64, description="`next` of the page before; without it the first page.")]
+After = Annotated[
+    str | None,
+    Query(pattern=r"^[a-z]{2,5}_[0-9a-z]{26}$", description="`next` of the page before; without it the first page."),
+]
+
+
+def _in_reach(value: datetime.datetime) -> datetime.datetime:
+    if not 1900 <= value.year <= 9000:
+        raise ValueError("a year from 1900 to 9000")
+    return value
+
+
+Moment = Annotated[AwareDatetime, AfterValidator(_in_reach)]
+"""A time with its zone, not so near the calendar's ends that it has no UTC."""
 
 
 class Page(BaseModel, Generic[Item]):

@@ -12,7 +12,7 @@ from specimap.infra.logs import logger, set_up_logs
 from specimap.infra.migrate import migrate
 from specimap.infra.settings import load_settings
 from specimap.workers.processes import COMMAND
-from specimap.workers.stage_main import die_with_parent
+from specimap.workers.stage_main import die_with
 
 
 def main() -> int:
@@ -20,11 +20,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m specimap.workers")
     parser.add_argument("--slot", type=int, default=0)
     parser.add_argument("--kind", choices=("cpu", "gpu"), default="cpu")
-    parser.add_argument("--child", action="store_true", help="end when the parent ends")
+    parser.add_argument("--parent", type=int, help="process id of the parent, to end when it ends")
     parser.add_argument("--stage-command", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.child:
-        die_with_parent()
+    if options.parent is not None:
+        die_with(options.parent)
     try:
         settings = load_settings()
         set_up_logs(settings)

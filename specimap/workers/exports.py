@@ -61,11 +61,12 @@ def run_export(
             work.mkdir(parents=True)
         labels_hash = _fetch(database, storage, export.cloud_id, format, work)
         _make(work, format, target, settings, lambda: _held(database, export_id, executor), cancelled)
-        key, size = f"exports/{export_id}/{target.name}", target.stat().st_size
+        # Each attempt has a place of its own: one that lost the row cannot replace the file that the row names.
+        key, size = f"exports/{export_id}/{work.stem}/{target.name}", target.stat().st_size
         storage.put_file(key, target)
         done = {"state": "succeeded", "storage_key": key, "size": size, "error": None, "labels_hash": labels_hash}
-        if not _finish(database, export_id, executor, done) and _gone(database, export_id):
-            storage.delete(f"exports/{export_id}")
+        if not _finish(database, export_id, executor, done):
+            storage.delete(key)
     except _LostError:
         logger().warning("export lost", export=export_id)
     except (CancelledError, DatabaseUnavailableError):
@@ -111,11 +112,6 @@ def _finish(database: Database, export_id: str, executor: str, values: dict[str,
     with database.session() as session:
         done = session.execute(sa.update(Export).where(held).values(**values).returning(Export.id))
         return done.first() is not None
-
-
-def _gone(database: Database, export_id: str) -> bool:
-    with database.session() as session:
-        return session.get(Export, export_id) is None
 
 
 # ---- the file -----------------------------------------------------------------------------------------

@@ -135,7 +135,7 @@ class Processes:
     """Gives out processes and keeps one in reserve."""
 
     def __init__(self, command: Sequence[str] = COMMAND, *, memory_bytes: int = 0) -> None:
-        self._command = (*command, str(memory_bytes))
+        self._command = (*command, str(memory_bytes), str(os.getpid()))
         self._spare: StageProcess | None = None
         self._starting: asyncio.Task[None] | None = None
 

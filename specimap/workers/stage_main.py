@@ -18,10 +18,10 @@ from typing import Any, TextIO
 PR_SET_PDEATHSIG = 1
 
 
-def die_with_parent() -> None:
-    """End this process when its parent ends, however that happens."""
+def die_with(parent: int) -> None:
+    """End this process when its parent, of that process id, ends, however that happens."""
     ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() == 1:  # it ended before the line above
+    if os.getppid() != parent:  # it ended before the line above
         os._exit(1)
 
 
@@ -54,15 +54,15 @@ def _run(spec: dict[str, Any], out: TextIO) -> None:
 
 
 def main() -> None:
-    """Serve one stage."""
-    die_with_parent()
+    """Serve one stage. Arguments: the most address space it may take, 0 for any, and the parent's process id."""
+    memory_bytes, parent = (int(value) for value in sys.argv[1:3])
+    die_with(parent)
     # Libraries that print would break the lines that the worker reads.
     out = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    limit = int(sys.argv[1]) if len(sys.argv) > 1 else 0
-    if limit:
-        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    if memory_bytes:
+        resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
     _load()
     _say(out, event="ready")
     line = sys.stdin.readline()

@@ -152,7 +152,14 @@ class Worker:
 
         @DBOS.workflow(name=MAKE_EXPORT, max_recovery_attempts=None)
         async def make_export(export_id: str) -> str:
-            await asyncio.to_thread(run_export, export_id, self._database, self._storage, self.settings, self.executor)
+            stop = threading.Event()
+            try:
+                await asyncio.to_thread(
+                    run_export, export_id, self._database, self._storage, self.settings, self.executor,
+                    cancelled=stop.is_set,
+                )  # fmt: skip
+            finally:
+                stop.set()
             return "done"
 
         self._workflows = run_job, make_export, stage_step

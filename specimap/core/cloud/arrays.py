@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from specimap.core.cloud.schema import ARRAYS
 from specimap.core.cloud.shards import PointArray, damage
+from specimap.core.cloud.source import ByteSource, Folder
 from specimap.core.errors import CloudDamagedError, NotFoundError
 from specimap.core.geometry import Array
 
@@ -23,44 +24,63 @@ from specimap.core.geometry import Array
 class CloudArrays:
     """The arrays of an open cloud. They are read when they are first asked for, and kept; spectra are never kept.
 
-    ``path``: the group; ``attributes``: its attributes. Safe to share between threads that read.
+    ``source``: the group's files; ``attributes``: its attributes. Safe to share between threads that read.
     """
 
-    path: Path
+    source: ByteSource
     attributes: Mapping[str, object]
 
     @classmethod
-    def open(cls, path: Path) -> Self:
-        """Raises NotFoundError where there is no cloud, CloudDamagedError where it is not whole."""
-        document = path / "zarr.json"
-        if not document.is_file():
-            raise NotFoundError(f"There is no cloud at {path}.", advice="Check the path, or that the run has finished.")
+    def open(cls, group: Path | ByteSource) -> Self:
+        """Open the group in a folder, or from any other source of its bytes.
+
+        Raises NotFoundError where there is no cloud, CloudDamagedError where it is not whole.
+        """
+        source: ByteSource = Folder(group) if isinstance(group, Path) else group
         try:
-            metadata = json.loads(document.read_text(encoding="utf-8"))
+            metadata = json.loads(source.read("zarr.json"))
             if metadata["node_type"] != "group":
                 raise ValueError(f"it is of the type {metadata['node_type']}")
             attributes = dict(metadata.get("attributes", {}))
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (FileNotFoundError, NotADirectoryError) as error:
+            where = source.path if isinstance(source, Folder) else source.name
+            raise NotFoundError(
+                f"There is no cloud at {where}.", advice="Check the path, or that the run has finished."
+            ) from error
+        except (OSError, ValueError, LookupError, AttributeError, TypeError) as error:
             raise CloudDamagedError(
-                f"{path.name} is not a readable Zarr group: {error}.",
+                f"{source.name} is not a readable Zarr group: {error}.",
                 advice="Repeat the run; finished stages are not repeated.",
             ) from error
-        missing = [name for name in ARRAYS if not (path / name / "zarr.json").is_file()]
+        missing = [name for name in ARRAYS if not _exists(source, f"{name}/zarr.json")]
         if missing:
             raise CloudDamagedError(
-                f"{path.name} lacks the arrays {', '.join(missing)}: it is no cloud, or not whole.",
+                f"{source.name} lacks the arrays {', '.join(missing)}: it is no cloud, or not whole.",
                 advice="Repeat the run; finished stages are not repeated.",
                 array=missing[0],
             )
-        cloud = cls(path, attributes)
+        cloud = cls(source, attributes)
         sizes = {name: cloud.array(name).shape[0] for name, spec in ARRAYS.items() if spec.dimensions[0] == "point"}
         if len(set(sizes.values())) > 1 or len(cloud.array("spectra").shape) != 2:
             raise CloudDamagedError(
-                f"The arrays of {path.name} differ in length.", advice="Repeat the run.", lengths=sizes
+                f"The arrays of {source.name} differ in length.", advice="Repeat the run.", lengths=sizes
             )
         return cloud
 
     # ---- what it holds --------------------------------------------------------------------------------
+
+    @property
+    def path(self) -> Path:
+        """The group's folder. Raises ValueError where the cloud does not lie in one."""
+        if not isinstance(self.source, Folder):
+            raise ValueError(f"{self.source.name} is not in a folder")
+        return self.source.path
+
+    @property
+    def kept_bytes(self) -> int:
+        """Memory of the arrays read so far."""
+        # A copy: other threads read further arrays meanwhile.
+        return sum(values.nbytes for values in list(vars(self).values()) if isinstance(values, np.ndarray))
 
     @property
     def n_points(self) -> int:
@@ -144,14 +164,16 @@ class CloudArrays:
 
     @property
     def label_names(self) -> tuple[str, ...]:
-        """Labels that classifiers wrote back."""
+        """Labels that classifiers wrote into the group, where it is a folder."""
+        if not isinstance(self.source, Folder):
+            return ()
         return tuple(sorted(p.parent.name for p in self.path.glob("labels/*/zarr.json")))
 
     def label(self, name: str) -> Array:
         """Values (S, ...) of a label. Raises NotFoundError, CloudDamagedError."""
         if name not in self.label_names:
             raise NotFoundError(f"The cloud has no label {name!r}.", advice="", labels=self.label_names)
-        with damage(self.path, f"labels/{name}"):
+        with damage(self.source, f"labels/{name}"):
             return np.asarray(zarr.open_array(self.path / "labels" / name, mode="r")[...])
 
     # ---- inside ---------------------------------------------------------------------------------------
@@ -159,7 +181,7 @@ class CloudArrays:
     def array(self, name: str) -> PointArray:
         """The stored array of that name in :data:`~specimap.core.cloud.schema.ARRAYS`."""
         if name not in self._arrays:
-            self._arrays[name] = PointArray(self.path, name)
+            self._arrays[name] = PointArray(self.source, name)
         return self._arrays[name]
 
     @cached_property
@@ -175,6 +197,14 @@ class CloudArrays:
         values = array.read(0, array.shape[0])
         values.flags.writeable = False
         return values
+
+
+def _exists(source: ByteSource, key: str) -> bool:
+    try:
+        source.size(key)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True
 
 
 def _number(value: object, default: float) -> float:

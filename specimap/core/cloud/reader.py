@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from specimap.core.cloud.arrays import CloudArrays
-from specimap.core.cloud.schema import CHUNK_POINTS, tile_keys
+from specimap.core.cloud.outline import in_outline
+from specimap.core.cloud.schema import CHUNK_POINTS, TILE, tile_keys
 from specimap.core.cloud.shards import PointArray
 from specimap.core.errors import NotFoundError
 from specimap.core.geometry import Array
@@ -81,11 +82,29 @@ class Cloud(CloudArrays):
 
     def at_pixel(self, row: int, col: int) -> int | None:
         """The point of a pixel of the cube; None where the pixel has none."""
-        if not (0 <= row <= 0xFFFF and 0 <= col <= 0xFFFF):
-            return None
-        key = tile_keys(np.array([[row, col]], np.uint16))[0]
-        at = int(np.searchsorted(self._keys, key))
-        return at if at < self.n_points and self._keys[at] == key else None
+        point = int(self.at_pixels(np.array([[row, col]]))[0])
+        return None if point < 0 else point
+
+    def at_pixels(self, pixels: NDArray[np.integer]) -> Indices:
+        """The points (n,) of pixels (n, 2) row, column of the cube; -1 where a pixel has none."""
+        inside = np.asarray(((pixels >= 0) & (pixels <= 0xFFFF)).all(1))
+        keys = tile_keys(np.where(inside[:, None], pixels, 0).astype(np.uint16))
+        at = np.minimum(np.searchsorted(self._keys, keys), self.n_points - 1)
+        return np.where(inside & (self._keys[at] == keys), at, -1)
+
+    def in_polygon(self, vertices: ArrayLike) -> Indices:
+        """Increasing indices of the points whose pixel's centre lies in the polygon (n, 2) row, column of the cube.
+
+        By the even-odd rule; a centre on the outline lies inside.
+        """
+        outline = np.asarray(vertices, np.float64)
+        low, high = outline.min(0), outline.max(0)
+        # Points come in strips of tiles, row by row: those of the polygon's rows lie together.
+        strips = self._keys >> 20
+        start, stop = np.searchsorted(strips, [np.floor(low[0]) // TILE, np.floor(high[0]) // TILE + 1])
+        pixels = self.hsi_pixel[start:stop]
+        near = np.flatnonzero(((pixels >= low) & (pixels <= high)).all(1))
+        return np.asarray(start + near[in_outline(pixels[near], outline)])
 
     def in_box(self, low: ArrayLike, high: ArrayLike) -> Indices:
         """Increasing indices of the points in the box from ``low`` to ``high`` (3,) mm, borders included."""

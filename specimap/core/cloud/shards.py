@@ -1,13 +1,12 @@
 """Reading the sharded arrays of a cloud directly: several times faster than through zarr-python.
 
-Only the layout that Specimap writes is read here (local files, sharded along points, blosc); any other is
-left to zarr-python, so that a cloud which another program rewrote still opens.
+Only the layout that Specimap writes is read here (sharded along points, blosc); any other is left to zarr-python
+where it lies in a folder, so that a cloud which another program rewrote still opens.
 """
 
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -22,7 +21,8 @@ from google_crc32c import value as crc32c
 from numcodecs import blosc  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
-from specimap.core.errors import CloudDamagedError
+from specimap.core.cloud.source import ByteSource, Folder
+from specimap.core.errors import CloudDamagedError, NotFoundError, SpecimapError
 from specimap.core.geometry import Array
 
 _ENTRY_BYTES, _CHECKSUM_BYTES = 16, 4
@@ -31,18 +31,27 @@ _READ_THREADS = 2
 
 
 @contextmanager
-def damage(path: Path, name: str) -> Iterator[None]:
-    """Turn whatever a reader stumbles on in array ``name`` of the group ``path`` into CloudDamagedError."""
+def damage(source: ByteSource, name: str) -> Iterator[None]:
+    """Turn whatever a reader stumbles on in array ``name`` of a group into CloudDamagedError.
+
+    What the source itself raises on purpose passes, but for a file that is not there.
+    """
     try:
         yield
-    except CloudDamagedError:
+    except NotFoundError as error:
+        raise _damaged(source, name, error) from error
+    except SpecimapError:
         raise
-    except (OSError, ValueError, KeyError, IndexError, RuntimeError, TypeError) as error:
-        raise CloudDamagedError(
-            f"The array {name} of {path.name} cannot be read: {error}.",
-            advice="Repeat the run; finished stages are not repeated.",
-            array=name,
-        ) from error
+    except (OSError, ValueError, LookupError, AttributeError, RuntimeError, TypeError) as error:
+        raise _damaged(source, name, error) from error
+
+
+def _damaged(source: ByteSource, name: str, error: Exception) -> CloudDamagedError:
+    return CloudDamagedError(
+        f"The array {name} of {source.name} cannot be read: {error}.",
+        advice="Repeat the run; finished stages are not repeated.",
+        array=name,
+    )
 
 
 class PointArray:
@@ -51,12 +60,13 @@ class PointArray:
     ``shape``, ``dtype``; ``chunk_points``: ranges that begin and end at its multiples are read without waste.
     """
 
-    def __init__(self, group: Path, name: str) -> None:
+    def __init__(self, group: Path | ByteSource, name: str) -> None:
         """Raises CloudDamagedError."""
-        self._group, self._name = group, name
+        self._source: ByteSource = Folder(group) if isinstance(group, Path) else group
+        self._name = name
         self._other: zarr.Array[Any] | None = None
-        with damage(group, name):
-            metadata = json.loads((group / name / "zarr.json").read_text(encoding="utf-8"))
+        with damage(self._source, name):
+            metadata = json.loads(self._source.read(f"{name}/zarr.json"))
             self.attributes: dict[str, object] = dict(metadata.get("attributes", {}))
             self.shape: tuple[int, ...] = tuple(metadata["shape"])
             if _is_ours(metadata):
@@ -64,8 +74,10 @@ class PointArray:
                 inner = metadata["codecs"][0]["configuration"]["chunk_shape"]
                 self._shard_points, self.chunk_points = int(outer[0]), int(inner[0])
                 self.dtype = np.dtype(metadata["data_type"])
+            elif not isinstance(self._source, Folder):
+                raise ValueError("it is not laid out as Specimap writes it")
             else:
-                self._other = zarr.open_array(group / name, mode="r", zarr_format=3)
+                self._other = zarr.open_array(self._source.path / name, mode="r", zarr_format=3)
                 self.dtype, self.chunk_points = self._other.dtype, self._other.chunks[0]
         self._index = lru_cache(None)(self._read_index)
 
@@ -75,7 +87,7 @@ class PointArray:
         Raises CloudDamagedError.
         """
         out = np.empty((stop - start, *self.shape[1:]), self.dtype) if out is None else out
-        with damage(self._group, self._name):
+        with damage(self._source, self._name):
             if self._other is not None:
                 out[...] = np.asarray(self._other[start:stop])
                 return out
@@ -112,9 +124,7 @@ class PointArray:
             raise ValueError("a chunk is missing")
         low, high = int(entries[:, 0].min()), int(entries.sum(1).max())
         # Chunks that were written together lie together: one read fetches them all.
-        with open(self._file(shard), "rb") as file:
-            file.seek(low)
-            content = memoryview(file.read(high - low))
+        content = memoryview(self._source.read(self._file(shard), low, high))
         if len(content) != high - low:
             raise ValueError("a shard is truncated")
         whole: Array | None = None
@@ -133,15 +143,17 @@ class PointArray:
     def _read_index(self, shard: int) -> NDArray[np.uint64]:
         """Offset and length in bytes (chunks, 2) of the chunks in a shard's file."""
         size = self._shard_points // self.chunk_points * _ENTRY_BYTES
-        with open(self._file(shard), "rb") as file:
-            file.seek(-(size + _CHECKSUM_BYTES), os.SEEK_END)
-            content = file.read()
+        file = self._file(shard)
+        end = self._source.size(file)
+        if end < size + _CHECKSUM_BYTES:
+            raise ValueError("a shard is truncated")
+        content = self._source.read(file, end - size - _CHECKSUM_BYTES, end)
         if crc32c(content[:size]) != int.from_bytes(content[size:], "little"):
             raise ValueError("the checksum of a shard's index is wrong")
         return np.frombuffer(content[:size], "<u8").reshape(-1, 2)
 
-    def _file(self, shard: int) -> Path:
-        return self._group.joinpath(self._name, "c", str(shard), *["0"] * (len(self.shape) - 1))
+    def _file(self, shard: int) -> str:
+        return "/".join([self._name, "c", str(shard), *["0"] * (len(self.shape) - 1)])
 
 
 def _is_ours(metadata: dict[str, Any]) -> bool:

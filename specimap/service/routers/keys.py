@@ -7,14 +7,14 @@ from typing import Annotated, Any, Literal
 
 import sqlalchemy as sa
 from fastapi import APIRouter, Path, Query, Request
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from specimap.core.errors import NotFoundError
 from specimap.infra.database import utc_now
 from specimap.infra.models import ApiKey, AuditEntry
 from specimap.service.auth import Admin, Keyring, new_key
 from specimap.service.context import Context, audit
-from specimap.service.paging import Limit, Page, page_of
+from specimap.service.paging import Limit, Moment, Page, page_of
 
 router = APIRouter(prefix="/v1", tags=["keys"])
 KeyId = Annotated[str, Path(pattern=r"^key_[0-9a-z]{26}$")]
@@ -29,7 +29,7 @@ class KeyRequest(BaseModel):
 
     name: str = Field(min_length=1, max_length=100, description="Whose key it is; no patient's name.")
     scopes: list[Literal["upload", "read", "label", "admin"]] = Field(min_length=1)
-    expires_at: AwareDatetime | None = None
+    expires_at: Moment | None = None
     rate_per_minute: int | None = Field(default=None, ge=1, le=10_000_000)
     quota_bytes: int | None = Field(default=None, ge=1, le=2**60)
 
@@ -107,7 +107,9 @@ def revoke_key(context: Context, principal: Admin, request: Request, key_id: Key
 def list_audit(
     context: Context,
     principal: Admin,
-    target: Annotated[str | None, Query(max_length=64, description="Only what was done to this thing.")] = None,
+    target: Annotated[
+        str | None, Query(pattern=r"^[a-z]{2,5}_[0-9a-z]{26}$", description="Only what was done to this thing.")
+    ] = None,
     after: Annotated[int | None, Query(ge=1, description="`next` of the page before.")] = None,
     limit: Limit = 100,
 ) -> Page[Audited]:

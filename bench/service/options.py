@@ -1,0 +1,13 @@
+"""What a run of the benchmark is told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Options:
+    """``repeats``: of each measurement; ``jobs``: how many jobs are run."""
+
+    repeats: int
+    jobs: int

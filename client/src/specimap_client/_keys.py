@@ -1,0 +1,45 @@
+"""Keys, for administrators."""
+
+from __future__ import annotations
+
+import builtins
+import datetime
+from collections.abc import Sequence
+from typing import Literal
+
+from specimap_client._http import Session, path
+from specimap_client._models import Key, NewKey, id_of
+
+Scope = Literal["upload", "read", "label", "admin"]
+
+
+class Keys:
+    """``client.keys``. All need the scope ``admin``."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+
+    def create(
+        self,
+        name: str,
+        scopes: Sequence[Scope],
+        *,
+        expires_at: datetime.datetime | None = None,
+        rate_per_minute: int | None = None,
+        quota_bytes: int | None = None,
+    ) -> NewKey:
+        """A new key; its ``key`` is shown this once. ``expires_at`` is aware."""
+        body = {
+            "name": name, "scopes": builtins.list(scopes), "rate_per_minute": rate_per_minute,
+            "quota_bytes": quota_bytes,
+            "expires_at": None if expires_at is None else expires_at.astimezone(datetime.UTC).isoformat(),
+        }  # fmt: skip
+        return NewKey.of(self._session.json("POST", path("keys"), json=body))
+
+    def list(self) -> builtins.list[Key]:
+        """All keys, revoked ones too."""
+        return [Key.of(item) for item in self._session.json("GET", path("keys"))]
+
+    def revoke(self, key: Key | str) -> None:
+        """Revoke a key by its id; it is refused within two seconds everywhere."""
+        self._session.request("DELETE", path("keys", id_of(key)))

@@ -1,0 +1,154 @@
+"""Photos: does one decode, is it sharp and well lit, and which markers does it show."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from specimap.core.acquisition import PHOTO_FORMATS, AcquisitionSettings, read_photo
+from specimap.core.errors import NoMarkersFoundError, PhotoUnreadableError, WrongDictionaryError
+from specimap.core.fiducials import detect_markers, fitting_dictionaries
+from specimap.core.intake.verdict import Verdict
+
+LEAST_SIDE_PX = 240
+"""Of the longer side: below it no marker in a usual view has the 7 pixels an edge needs."""
+LEAST_MARKERS = 2
+# Measured at working size on 80 photos of phones and phantoms, sharp, defocused and shaken: sharp ones have 0.0099 and
+# more, those defocused by two pixels or shaken by 15 at most 0.004, in their own scene at most a tenth of a sharp one.
+LEAST_SHARPNESS = 0.001
+LEAST_SHARPNESS_OF_OTHERS = 0.1
+LEAST_OTHERS = 3
+# Edges lie in all directions: sharp photos have 0.23 and more, those shaken by nine pixels less than 0.1.
+LEAST_ISOTROPY = 0.12
+MOST_CLIPPED = 0.2
+DARKEST_BRIGHT_END = 50
+SUFFIXES = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "TIFF": ".tif", "HEIF": ".heic"}
+
+_SECOND_DERIVATIVES = tuple(
+    np.array(rows, np.float32)
+    for rows in (
+        ((0, 0, 0), (1, -2, 1), (0, 0, 0)), ((0, 1, 0), (0, -2, 0), (0, 1, 0)),
+        ((0.5, 0, 0), (0, -1, 0), (0, 0, 0.5)), ((0, 0, 0.5), (0, -1, 0), (0.5, 0, 0)),
+    )
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Others:
+    """The acquisition's accepted photos so far: their sharpness, and their (width, height)."""
+
+    sharpness: Sequence[float] = ()
+    sizes: Sequence[tuple[int, int]] = ()
+
+
+def judge_photo(path: Path, dictionary: str, others: Others) -> Verdict:
+    """Judge a photo. Facts: ``suffix`` by its format, ``width``, ``height``, ``sharpness``, ``marker_ids``,
+    ``dictionary_seen`` where its markers are of another one.
+    """
+    facts: dict[str, Any] = {
+        "suffix": ".bin", "width": None, "height": None, "sharpness": None, "marker_ids": [], "dictionary_seen": None,
+    }  # fmt: skip
+    try:
+        facts["suffix"] = _suffix(path)
+        photo = read_photo(path, AcquisitionSettings())
+    except PhotoUnreadableError as error:
+        return Verdict("refused", error.code, error.message.replace(path.name, "The photo", 1), error.advice, facts)
+    width, height = photo.full_size
+    facts |= {"width": width, "height": height}
+    if max(width, height) < LEAST_SIDE_PX:
+        reason = f"It has {width} x {height} pixels; markers do not show in so few."
+        return Verdict("refused", "photo_too_small", reason, "Give the photo as the phone made it.", facts)
+    grey = photo.grey
+    sharpness, isotropy = directional_sharpness(grey)
+    ids = sorted({found.marker_id for found in detect_markers(grey, dictionary, expected=LEAST_MARKERS)})
+    facts |= {"sharpness": round(sharpness, 6), "marker_ids": ids}
+    for doubt in (
+        _blurred(sharpness, isotropy, others.sharpness), _exposure(photo.image, grey),
+        _markers(ids, grey, dictionary), _foreign((width, height), others.sizes),
+    ):  # fmt: skip
+        if doubt is not None:
+            return Verdict(doubt.verdict, doubt.code, doubt.reason, doubt.advice, facts | doubt.facts)
+    return Verdict(facts=facts)
+
+
+def directional_sharpness(grey: NDArray[np.uint8]) -> tuple[float, float]:
+    """Sharpness of (H, W) in its least sharp direction, and that over the one in its sharpest.
+
+    Mean square of the second derivative along a row, a column and both diagonals, over the variance. Shaking blurs
+    along one direction only, which the Laplacian does not notice.
+    """
+    spread = max(float(grey.var()), 1.0)
+    energies = [
+        float(np.square(cv2.filter2D(grey, cv2.CV_32F, kernel)).mean()) / spread for kernel in _SECOND_DERIVATIVES
+    ]
+    return min(energies), min(energies) / max(*energies, 1e-12)
+
+
+def _suffix(path: Path) -> str:
+    try:
+        with Image.open(path, formats=PHOTO_FORMATS) as opened:
+            return SUFFIXES.get(opened.format or "", ".bin")
+    except Exception as error:
+        # Not a list of types: on damaged files the decoders raise anything.
+        raise PhotoUnreadableError(
+            "The photo is of no known image format.", advice="Give a JPEG, HEIC, PNG or TIFF as the camera made it."
+        ) from error
+
+
+def _blurred(sharpness: float, isotropy: float, others: Sequence[float]) -> Verdict | None:
+    usual = median(others) if len(others) >= LEAST_OTHERS else 0.0
+    if sharpness < LEAST_SHARPNESS or isotropy < LEAST_ISOTROPY:
+        reason = "It is shaken." if isotropy < LEAST_ISOTROPY else "It is out of focus."
+    elif sharpness < LEAST_SHARPNESS_OF_OTHERS * usual:
+        reason = "It is much less sharp than the other photos."
+    else:
+        return None
+    return Verdict("doubtful", "photo_blurred", reason, "Take it again: hold still and tap on the specimen to focus.")
+
+
+def _exposure(image: NDArray[np.uint8], grey: NDArray[np.uint8]) -> Verdict | None:
+    clipped = float((image.min(2) >= 254).mean())
+    if clipped > MOST_CLIPPED:
+        reason = f"{clipped:.0%} of it is overexposed."
+        return Verdict("doubtful", "photo_overexposed", reason, "Take it again with less light or shorter exposure.")
+    if float(np.percentile(grey, 95)) < DARKEST_BRIGHT_END:
+        return Verdict("doubtful", "photo_underexposed", "It is too dark.", "Take it again with more light.")
+    return None
+
+
+def _markers(ids: list[int], grey: NDArray[np.uint8], dictionary: str) -> Verdict | None:
+    if len(ids) >= LEAST_MARKERS:
+        return None
+    if ids:
+        reason = f"Only marker {ids[0]} reads in it."
+        return Verdict(
+            "doubtful", "few_markers", reason, "Take it again with two or more markers whole in the picture."
+        )
+    # Twice at different sizes: texture that reads as a marker by chance does not do so again.
+    fitting = fitting_dictionaries([grey, np.asarray(cv2.resize(grey, None, fx=0.75, fy=0.75), np.uint8)])
+    if fitting:
+        seen = next(iter(fitting))
+        reason = f"Its markers are of {seen}, the acquisition's of {dictionary}."
+        advice = "Use the marker cards of the acquisition, or make an acquisition with that dictionary."
+        return Verdict("doubtful", WrongDictionaryError.code, reason, advice, {"dictionary_seen": seen})
+    advice = "Take it again with two or more markers whole in the picture, lit and not covered."
+    return Verdict("doubtful", NoMarkersFoundError.code, f"No marker of {dictionary} reads in it.", advice)
+
+
+def _foreign(size: tuple[int, int], others: Sequence[tuple[int, int]]) -> Verdict | None:
+    """Photos of another camera's size are left out of a job; held upright or across makes no difference."""
+    shapes = Counter(tuple(sorted(other)) for other in others)
+    if len(others) < LEAST_OTHERS or tuple(sorted(size)) in shapes:
+        return None
+    (a, b), _ = shapes.most_common(1)[0]
+    reason = f"It has {size[0]} x {size[1]} pixels, the others {b} x {a}: another camera or zoom."
+    return Verdict("doubtful", "photo_foreign", reason, "Take all photos with one camera at one setting.")

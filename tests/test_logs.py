@@ -1,0 +1,52 @@
+"""What an error leaves in the log: where it was raised, never the values that were at hand."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import pytest
+import structlog
+
+from specimap.infra.logs import logger, set_up_logs
+from specimap.infra.settings import load_settings
+
+
+@pytest.fixture(autouse=True)
+def as_before() -> Iterator[None]:
+    """Put the process's logging back."""
+    root, config = logging.getLogger(), structlog.get_config()
+    was_configured, handlers, level = structlog.is_configured(), list(root.handlers), root.level
+    yield
+    root.handlers[:] = handlers
+    root.setLevel(level)
+    structlog.reset_defaults()
+    if was_configured:
+        structlog.configure(**config)
+
+
+@pytest.mark.parametrize("form", ["json", "text"])
+def test_tracebacks_hold_no_values(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], form: Literal["json", "text"]
+) -> None:
+    set_up_logs(load_settings(data_dir=tmp_path, log_format=form))
+
+    def fails(key: str) -> None:
+        assert key
+        raise ValueError("it broke")
+
+    try:
+        fails("spk_" + "1" * 20)
+    except ValueError:
+        logger().exception("unforeseen", job="job_1")
+    text = capsys.readouterr().err
+    assert "it broke" in text
+    assert "fails" in text
+    assert "1" * 20 not in text
+    if form == "json":
+        entry = json.loads(text)
+        assert (entry["event"], entry["level"], entry["job"]) == ("unforeseen", "error", "job_1")
+        assert entry["exception"][0]["exc_type"] == "ValueError"
