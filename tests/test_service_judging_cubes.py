@@ -203,8 +203,8 @@ def test_a_thousand_hostile_cubes(tmp_path: Path) -> None:
             else:
                 path = tmp_path / "cube.npy"
                 damaged = bytearray(whole)
-                for at in rng.integers(0, 140, 4):
-                    damaged[at] = rng.integers(256)
+                for at in rng.integers(0, 140, 2):
+                    damaged[at] = rng.choice(list(b"0123456789<>|,u1f8 "))
                 path.write_bytes(damaged)
             part = judge.part(path, path.suffix, None)
             verdict = judge.cube(path) if part["verdict"] != "refused" else part
@@ -214,5 +214,6 @@ def test_a_thousand_hostile_cubes(tmp_path: Path) -> None:
     finally:
         judge.close()
     # Every kind of refusal occurs, and none of the files brought the reader down.
-    assert set(codes) >= {None, "cube_header_invalid", "cube_truncated"}
+    assert set(codes) >= {None, "cube_header_invalid", "cube_truncated", "cube_format_unknown"}
+    assert min(codes[code] for code in (None, "cube_header_invalid", "cube_truncated")) >= 50
     assert not {"judging_crashed", "judging_too_slow"} & set(codes)

@@ -14,7 +14,7 @@ from specimap.cli.supervisor import Supervisor
 from specimap.core.errors import SettingsError
 from specimap.infra.database import Database
 from specimap.infra.logs import set_up_logs
-from specimap.infra.migrate import migrate
+from specimap.infra.migrate import alone, migrate
 from specimap.infra.models import SCOPES, ApiKey
 from specimap.infra.settings import ServiceSettings, load_settings
 from specimap.infra.storage import Storage
@@ -125,7 +125,7 @@ def _first_key(database: Database) -> str | None:
     """An administrator's key where there is no key at all."""
     from specimap.service.auth import new_key
 
-    with database.session() as session:
+    with alone(database.engine), database.session() as session:
         if session.scalar(sa.select(sa.func.count()).select_from(ApiKey)):
             return None
         row, key = new_key("administrator", SCOPES)

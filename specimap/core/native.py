@@ -35,7 +35,8 @@ def open3d() -> ModuleType:
     except (ImportError, OSError) as error:
         raise BackendUnavailableError(
             f"Open3D does not load: {error}.",
-            advice="Install the system libraries it wants: sudo apt-get install libusb-1.0-0 libgomp1 libgl1",
+            advice="Install the system libraries it wants: "
+            "sudo apt-get install libusb-1.0-0 libgomp1 libgl1 libegl1 libx11-6 libidn2-0",
         ) from error
 
 

@@ -78,12 +78,6 @@ class UploadGoneError(SpecimapError, FileNotFoundError):
     code = "upload_gone"
 
 
-class FileRefusedError(SpecimapError, ValueError):
-    """A file has arrived but cannot be used; details hold the judgement."""
-
-    code = "file_refused"
-
-
 class JobConflictError(SpecimapError, ValueError):
     """The job's or acquisition's state does not allow what was asked."""
 
@@ -154,7 +148,6 @@ HTTP_STATUS: dict[type[SpecimapError], int] = {
     **core.HTTP_STATUS,
     ChecksumMismatchError: 460,
     DatabaseUnavailableError: 503,
-    FileRefusedError: 422,
     ForbiddenError: 403,
     IdempotencyConflictError: 409,
     JobConflictError: 409,

@@ -32,7 +32,7 @@ def migrate(database: Database) -> None:
     Raises:
         DatabaseUnavailableError: the server cannot be reached.
     """
-    with database_errors(), _alone(database.engine):
+    with database_errors(), alone(database.engine):
         # The engine's own function, since its client never migrates.
         DBOS.migrate(database.engine.url.render_as_string(hide_password=False))
         with database.engine.begin() as connection:
@@ -40,7 +40,8 @@ def migrate(database: Database) -> None:
 
 
 @contextmanager
-def _alone(engine: sa.Engine) -> Iterator[None]:
+def alone(engine: sa.Engine) -> Iterator[None]:
+    """Let no other program do what is done here at the same time."""
     if engine.dialect.name == "sqlite":
         file = engine.url.database
         if not file:

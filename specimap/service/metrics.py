@@ -60,9 +60,8 @@ class _FromDatabase(Collector):
 
     def _jobs(self) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
         with self._database.session() as session:
-            counts = {
-                state: n for state, n in session.execute(sa.select(Job.state, sa.func.count()).group_by(Job.state))
-            }
+            by_state = session.execute(sa.select(Job.state, sa.func.count()).group_by(Job.state))
+            counts = {row[0]: int(row[1]) for row in by_state}
             oldest = session.scalar(sa.select(sa.func.min(Job.created_at)).where(Job.state == "queued"))
             errors = session.scalars(sa.select(Job.error).where(Job.state == "failed")).all()
             seconds = session.scalars(sa.select(Job.seconds).where(Job.state == "succeeded")).all()

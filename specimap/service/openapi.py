@@ -25,7 +25,8 @@ def document() -> dict[str, Any]:
 
 def as_yaml(contract: dict[str, Any]) -> str:
     """The document in YAML, in the order in which the app describes itself."""
-    return yaml.safe_dump(contract, sort_keys=False, allow_unicode=True, width=110)
+    text: str = yaml.safe_dump(contract, sort_keys=False, allow_unicode=True, width=110)
+    return text
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import os
+import fcntl
 import signal
 import socket
 import threading
@@ -11,7 +11,7 @@ import time
 import uuid
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Any
+from typing import Any, TextIO
 
 import httpx
 from dbos import DBOS, DBOSConfig
@@ -58,6 +58,7 @@ class Worker:
         self._processes = Processes(command, memory_bytes=settings.stage_memory_bytes)
         self._kind = kind
         self._stopping = threading.Event()
+        self._note: TextIO | None = None
 
     def run(self) -> None:
         """Work until SIGTERM or SIGINT; the database has been migrated.
@@ -178,20 +179,13 @@ class Worker:
         """Remove work folders of processes of this machine that are gone."""
         work = self.settings.scratch / "work"
         work.mkdir(parents=True, exist_ok=True, mode=0o700)
-        (work / f"{self.executor.rsplit(':', 1)[-1]}.pid").write_text(str(os.getpid()), encoding="ascii")
-        for note in work.glob("*.pid"):
-            with suppress(OSError, ValueError):
-                if not _alive(int(note.read_text(encoding="ascii"))):
-                    for folder in work.glob(f"*.{note.stem}"):
-                        remove(folder)
-                    remove(note)
-
-
-def _alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
+        if self._note is None:
+            self._note = open(work / f"{self.executor.rsplit(':', 1)[-1]}.lock", "w", encoding="ascii")  # noqa: SIM115
+            fcntl.flock(self._note, fcntl.LOCK_EX)
+        for path in work.glob("*.lock"):
+            with suppress(OSError), open(path, encoding="ascii") as note:
+                # Held as long as its worker lives, in whatever container; process ids repeat.
+                fcntl.flock(note, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                for folder in work.glob(f"*.{path.stem}"):
+                    remove(folder)
+                remove(path)

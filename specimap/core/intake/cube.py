@@ -24,6 +24,7 @@ CLAIMED_WHOLE = frozenset({".h5", ".hdf5", ".he5", ".nc", ".nc4", ".cdf", ".mat"
 ZIP_MAGIC = b"PK\x03\x04"
 SAMPLED_ROWS = 48
 MEAN_BANDS = 8
+MOST_BANDS = 1_000_000
 
 
 def judge_part(path: Path, claimed: str, expected_bytes: int | None) -> Verdict:
@@ -93,6 +94,12 @@ def _sampled_mean(cube: Cube) -> NDArray[np.float32]:
 
 
 def _header_facts(header: EnviHeader) -> dict[str, Any]:
+    if header.bands > MOST_BANDS:
+        raise CubeHeaderError(
+            f"The header says {header.bands} bands, more than any camera has.",
+            advice="Correct 'bands' in the header, or export the cube again.",
+            field="bands",
+        )
     wavelengths, about = nanometres(header.wavelengths, header.wavelength_units, header.bands)
     _, about_bands = bad_band_mask(header.bad_band_list, header.bands)
     return {

@@ -9,6 +9,7 @@ from fastapi import APIRouter, Response
 from pydantic import BaseModel, Field
 
 from specimap import __version__
+from specimap.infra.database import database_seconds
 from specimap.infra.models import Lease
 from specimap.service.auth import Admin
 from specimap.service.context import Context
@@ -40,7 +41,8 @@ async def healthz() -> Health:
 def readyz(context: Context) -> Readiness:
     """Whether requests can be served: 503 with a code where the database or the storage does not answer."""
     with context.database.session() as session:
-        workers = session.scalar(sa.select(sa.func.count()).select_from(Lease)) or 0
+        oldest = database_seconds(context.database.engine) - context.settings.lease_seconds
+        workers = session.scalar(sa.select(sa.func.count()).where(Lease.heartbeat >= oldest)) or 0
     context.storage.check()
     return Readiness(status="ready", workers=workers)
 
