@@ -39,6 +39,8 @@ class Arrival:
 
 @dataclass(frozen=True)
 class Known:
+    """An acquisition as it stood when the judging began."""
+
     dictionary: str
     files: tuple[StoredFile, ...]
 
@@ -62,6 +64,12 @@ class Findings:
 
 
 def judged(context: AppContext, arrival: Arrival, known: Known, folder: Path) -> Findings:
+    """Judge the file ``file`` in ``folder``, which holds nothing else.
+
+    Raises:
+        JobConflictError: the cube has this part already. NotFoundError: its other part was deleted meanwhile.
+        BackendUnavailableError: nothing can be judged now.
+    """
     if arrival.role == "photo":
         return _photo(context, arrival, known, folder / "file")
     return _cube(context, arrival, known, folder)
@@ -77,9 +85,9 @@ def _photo(context: AppContext, arrival: Arrival, known: Known, path: Path) -> F
                 }
             )  # fmt: skip
             return Findings(PurePosixPath(photo.label).suffix, own)
-    judged = [PhotoJudgement.model_validate(photo.judgement) for photo in known.photos]
-    sharpness = [j.sharpness for j in judged if j.sharpness is not None and j.code != "photo_blurred"]
-    sizes = [(j.width, j.height) for j in judged if j.width is not None and j.height is not None]
+    others = [PhotoJudgement.model_validate(photo.judgement) for photo in known.photos]
+    sharpness = [j.sharpness for j in others if j.sharpness is not None and j.code != "photo_blurred"]
+    sizes = [(j.width, j.height) for j in others if j.width is not None and j.height is not None]
     verdict = context.judge.photo(path, known.dictionary, sharpness, sizes)
     return Findings(verdict.pop("suffix"), PhotoJudgement.model_validate(verdict))
 

@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 
 from specimap.core.errors import NotFoundError
 from specimap.core.files import disk_errors
-from specimap.infra.errors import JobConflictError
+from specimap.infra.errors import DatabaseUnavailableError, JobConflictError
 from specimap.infra.models import Acquisition, StoredFile, Upload
 from specimap.service.context import AppContext, audit
 from specimap.service.inspection import Arrival, Findings, Known, judged
@@ -44,7 +44,7 @@ def take_in(context: AppContext, arrival: Arrival) -> StoredFile:
     try:
         for _ in range(ATTEMPTS):
             known = _known(context, arrival.acquisition_id)
-            with _aside(context, arrival) as folder:
+            with _aside(context) as folder:
                 if moved:
                     context.storage.fetch(key, folder / "file")
                 else:
@@ -61,6 +61,9 @@ def take_in(context: AppContext, arrival: Arrival) -> StoredFile:
             if stored is not None:
                 context.metrics.judged.labels(findings.own.verdict).inc()
                 return stored
+    except DatabaseUnavailableError:
+        # The commit may have come through all the same: what it speaks of must be there.
+        raise
     except BaseException:
         if moved:
             context.storage.delete(key)
@@ -84,7 +87,7 @@ def _files(session: Session, acquisition_id: str) -> tuple[StoredFile, ...]:
 
 
 @contextmanager
-def _aside(context: AppContext, arrival: Arrival) -> Iterator[Path]:
+def _aside(context: AppContext) -> Iterator[Path]:
     """A folder of its own, in which the file lies under a name of ours."""
     folder = context.settings.scratch / "judging" / uuid.uuid4().hex
     with disk_errors(folder):

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import os
+import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import Any
 
 from tuspyserver.storage import TusStorage
 
 from specimap.core.errors import SpecimapError
 from specimap.core.files import disk_errors
+from specimap.infra.errors import StorageUnavailableError
 from specimap.service.auth import Principal
 from specimap.service.tus import BATCH, Exchange, exchange, http_date
 from specimap.service.upload_files import POLL_SECONDS, UploadFiles, busy
@@ -22,12 +25,40 @@ LOCK_SECONDS = 4.0
 
 
 class _Held:
-    """A locked file that a request appends to."""
+    """A locked file that a request appends to. ``error`` is what a write failed with."""
 
     def __init__(self, handle: int, holder: Exchange) -> None:
-        self.handle, self.holder = handle, holder
+        self.holder = holder
         self.pending = bytearray()
         self.error: SpecimapError | None = None
+        self._handle = handle
+        self._lock = threading.Lock()
+
+    def write(self, folder: Path, *, sync: bool) -> int:
+        """Append what is pending; returns its bytes. Raises StorageFullError, StorageUnavailableError."""
+        with self._lock:
+            data, self.pending = self.pending, bytearray()
+            try:
+                with disk_errors(folder), memoryview(data) as view:
+                    at = 0
+                    while at < len(view):
+                        at += os.write(self._handle, view[at:])
+                    if sync:
+                        os.fdatasync(self._handle)
+            except SpecimapError as error:
+                self.error = error
+                raise
+            except OSError as error:
+                self.error = StorageUnavailableError("The bytes cannot be written.", advice="Try again later.")
+                raise self.error from error
+            return len(data)
+
+    def close(self) -> None:
+        """Let go of the file and its lock; waits for a write that a cancelled request left under way."""
+        with self._lock:
+            os.close(self._handle)
+            # A write that begins after this fails instead of reaching another file of the same number.
+            self._handle = -1
 
 
 class UploadStore(TusStorage):
@@ -67,20 +98,8 @@ class UploadStore(TusStorage):
             await asyncio.to_thread(self._write, self._held[uid], sync=True)
 
     def _write(self, held: _Held, *, sync: bool) -> None:
-        data, held.pending = held.pending, bytearray()
-        try:
-            with disk_errors(self._files.folder):
-                with memoryview(data) as view:
-                    at = 0
-                    while at < len(view):
-                        at += os.write(held.handle, view[at:])
-                self._received(len(data))
-                if sync:
-                    os.fdatasync(held.handle)
-        except SpecimapError as error:
-            # Raised when the lock is let go: from here the library would answer it with success.
-            held.error = error
-            raise
+        # A failure is raised again when the lock is let go: from here the library would answer it with success.
+        self._received(held.write(self._files.folder, sync=sync))
 
     async def finalize(self, uid: str) -> None:
         """Nothing: a whole file is finished by the completion hook."""
@@ -93,9 +112,6 @@ class UploadStore(TusStorage):
         """End the upload."""
         principal = exchange().principal
         assert principal is not None
-        if exchange().upload is not None and exchange().upload.state != "open":  # type: ignore[union-attr]
-            await asyncio.to_thread(self._delete, uid, principal)
-            return
         async with self.lock(uid):
             await asyncio.to_thread(self._delete, uid, principal)
 
@@ -146,6 +162,6 @@ class UploadStore(TusStorage):
             yield
         finally:
             del self._held[uid]
-            os.close(handle)
+            held.close()
         if held.error is not None:
             raise held.error

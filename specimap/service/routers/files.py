@@ -31,6 +31,7 @@ from specimap.service.room import (
     quota_left,
 )
 from specimap.service.routers.acquisitions import check_idle
+from specimap.service.routers.uploads import Files
 
 router = APIRouter(prefix="/v1", tags=["files"])
 DISK_EVERY = 64 * 1024 * 1024
@@ -97,11 +98,11 @@ def _over_quota(left: int) -> QuotaExceededError:
 
 @router.post("/acquisitions/{acquisition_id}/files", status_code=201, openapi_extra=FORM)
 async def add_files(
-    context: Context, principal: Uploader, request: Request, acquisition_id: AcquisitionId
+    context: Context, principal: Uploader, uploads: Files, request: Request, acquisition_id: AcquisitionId
 ) -> list[File]:
     """Send some files in one form: `role` before its files. For large files and shaky networks use /v1/uploads."""
     room = await asyncio.to_thread(_room, context, principal, request, acquisition_id)
-    form = FormFiles(context.settings.scratch, room)
+    form = FormFiles(uploads.folder, room)
     try:
         parts = await form.read(request)
         context.metrics.uploaded.inc(sum(part.size for part in parts))
