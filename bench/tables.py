@@ -1,4 +1,7 @@
-"""``python -m bench.tables``: the newest accuracy record into README.md and docs/accuracy.md, between their marks."""
+"""``python -m bench.tables``: the newest records into README.md, docs/accuracy.md and docs/performance.md.
+
+They go between marks in these pages.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.record import RESULTS
+from bench.service.parts import PARTS, in_markdown
 from specimap.core.files import write_text
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -16,11 +20,17 @@ REAL = "apple"
 
 def newest(part: str) -> dict[str, Any]:
     """Figures of the newest record of ``part``. Raises FileNotFoundError where there is none."""
+    figures: dict[str, Any] = newest_record(part)["figures"]
+    return figures
+
+
+def newest_record(part: str) -> dict[str, Any]:
+    """The newest record of ``part``, with its machine and time. Raises FileNotFoundError where there is none."""
     records = sorted(RESULTS.glob(f"*-{part}.json"))
     if not records:
-        raise FileNotFoundError(f"bench/results/ holds no record of {part}: run python -m bench --only {part}")
-    figures: dict[str, Any] = json.loads(records[-1].read_text(encoding="utf-8"))["figures"]
-    return figures
+        raise FileNotFoundError(f"bench/results/ holds no record of {part}: run make bench, or make bench-service")
+    record: dict[str, Any] = json.loads(records[-1].read_text(encoding="utf-8"))
+    return record
 
 
 def short_table(figures: dict[str, Any]) -> str:
@@ -82,6 +92,8 @@ def main() -> None:
     put(ROOT / "docs" / "accuracy.md", "accuracy", long_table(figures))
     if REAL in figures:
         put(ROOT / "docs" / "accuracy.md", "apple", real_line(figures[REAL]))
+    for part in PARTS:
+        put(ROOT / "docs" / "performance.md", part, in_markdown(part, newest_record(f"service-{part}")))
 
 
 def _cases(figures: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import boto3
+import httpx
 from moto.server import ThreadedMotoServer
 
 
@@ -17,9 +17,7 @@ def object_store(bucket: str) -> Iterator[str]:
     host, port = server.get_host_and_port()
     endpoint = f"http://{host}:{port}"
     try:
-        boto3.client(
-            "s3", endpoint_url=endpoint, region_name="us-east-1", aws_access_key_id="test", aws_secret_access_key="test"
-        ).create_bucket(Bucket=bucket)
+        httpx.put(f"{endpoint}/{bucket}", trust_env=False).raise_for_status()
         yield endpoint
     finally:
         server.stop()

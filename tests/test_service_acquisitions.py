@@ -15,6 +15,7 @@ from specimap.infra.database import utc_now
 from specimap.infra.ids import new_id
 from specimap.infra.models import Base, CloudRow, Job, JobEvent
 
+Parts = list[tuple[str, tuple[str | None, bytes | str]]]
 PHOTO = photos()[0].read_bytes()
 HEADER = (SAMPLES / "hsi" / "hsi.hdr").read_bytes()
 
@@ -90,7 +91,7 @@ def test_found_by_pseudonym_and_time_in_pages(service: Running) -> None:
 def test_files_are_listed_read_and_deleted(service: Running) -> None:
     client = service.client()
     acquisition = new_acquisition(client)
-    made = [sent(client, acquisition, "photo", f"IMG {k}.png", path.read_bytes()) for k, path in enumerate(photos()[:3])]
+    made = [sent(client, acquisition, "photo", f"IMG {path.stem}.png", path.read_bytes()) for path in photos()[:3]]
     assert [f["label"] for f in made] == ["photo-0001.jpg", "photo-0002.jpg", "photo-0003.jpg"]
     listed = client.get(f"/v1/acquisitions/{acquisition}/files").json()
     assert listed == made
@@ -150,7 +151,7 @@ def test_deleted_with_everything(service: Running) -> None:
     with service.database.session() as session:
         for table in Base.metadata.sorted_tables:
             if "acquisition_id" in table.c or table.name == "job_events":
-                column = table.c.get("acquisition_id", table.c.get("job_id"))
+                column = table.c["acquisition_id" if "acquisition_id" in table.c else "job_id"]
                 assert acquisition not in session.scalars(sa.select(column)).all()
                 assert job not in session.scalars(sa.select(column)).all()
     assert [item.key.split("/")[1] for item in service.storage.list("acquisitions")] == [other]
@@ -167,7 +168,7 @@ def test_several_files_of_several_roles_in_one_form(service: Running) -> None:
     client = service.client()
     acquisition = new_acquisition(client)
     digest = hashlib.sha256(PHOTO).hexdigest()
-    parts = [
+    parts: Parts = [
         ("role", (None, "photo")), ("sha256", (None, digest.upper())), ("file", ("ä b.jpg", PHOTO)),
         ("file", ("2.jpg", photos()[1].read_bytes())), ("role", (None, "cube")), ("file", ("h.hdr", HEADER)),
         ("file", ("h.raw", (SAMPLES / "hsi" / "hsi.raw").read_bytes())),
@@ -177,7 +178,7 @@ def test_several_files_of_several_roles_in_one_form(service: Running) -> None:
     assert [f["label"] for f in answer.json()] == ["photo-0001.jpg", "photo-0002.jpg", "cube.hdr", "cube.raw"]
     assert answer.json()[0]["name"] == "ä b.jpg"
     assert answer.json()[3]["judgement"]["quantity"] == "reflectance"
-    wrong = [("role", (None, "photo")), ("sha256", (None, "0" * 64)), ("file", ("x.jpg", PHOTO))]
+    wrong: Parts = [("role", (None, "photo")), ("sha256", (None, "0" * 64)), ("file", ("x.jpg", PHOTO))]
     refused = client.post(f"/v1/acquisitions/{acquisition}/files", files=wrong)
     assert (refused.status_code, refused.json()["code"]) == (460, "checksum_mismatch")
     assert list((service.settings.scratch / "uploads").iterdir()) == []
@@ -218,15 +219,18 @@ def test_forms_within_limits(tmp_path: Path) -> None:
         assert (large.status_code, large.json()["code"]) == (413, "payload_too_large")
         known = client.post(at, content=b"", headers={"Content-Type": "multipart/form-data; boundary=b"})
         assert known.status_code == 422
-        three = [("role", (None, "photo")), *(("file", (p.name, p.read_bytes())) for p in photos()[:3])]
+        three: Parts = [("role", (None, "photo")), *(("file", (p.name, p.read_bytes())) for p in photos()[:3])]
         assert client.post(at, files=three).json()["code"] == "quota_exceeded"
         assert client.get(at).json() == []
         assert client.post(at, files=three[:3]).status_code == 201
         assert send(client, acquisition, "photo", "x.jpg", photos()[5].read_bytes()).json()["code"] == "quota_exceeded"
         assert send(client, acquisition, "cube", "x.raw", b"x" * 450_000).json()["code"] == "quota_exceeded"
-        assert service.client().post(
-            at, content=iter([b"x" * 1000]), headers={"Content-Type": "multipart/form-data; boundary=b"}
-        ).json()["code"] == "request_invalid"
+        assert (
+            service.client()
+            .post(at, content=iter([b"x" * 1000]), headers={"Content-Type": "multipart/form-data; boundary=b"})
+            .json()["code"]
+            == "request_invalid"
+        )
         stranger = service.client(["read"])
         assert send(stranger, acquisition, "photo", "x.jpg", PHOTO).json()["code"] == "forbidden"
     with serving(tmp_path / "full", min_free_bytes=2**60) as service:

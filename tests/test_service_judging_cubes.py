@@ -76,8 +76,9 @@ def test_data_that_are_too_short(service: Running, first: str) -> None:
     judged = data["judgement"]
     assert (data["state"], data["label"], judged["code"]) == ("refused", "refused-cube-0001.raw", "cube_truncated")
     assert (judged["found_bytes"], judged["expected_bytes"]) == (len(DATA) - 2, len(DATA))
-    assert "The cube's data file (cube.raw) has not arrived." in (
-        client.get(f"/v1/acquisitions/{acquisition}").json()["missing"]
+    assert (
+        "The cube's data file (cube.raw) has not arrived."
+        in (client.get(f"/v1/acquisitions/{acquisition}").json()["missing"])
     )
     assert sent(client, acquisition, "cube", "x.raw", DATA)["judgement"]["verdict"] == "accepted"
     assert files_of(client, acquisition)["cube.hdr"]["judgement"]["verdict"] == "accepted"
@@ -118,7 +119,8 @@ def test_whole_files_and_useless_ones(service: Running, tmp_path: Path) -> None:
         ("x.npy", npy(np.full((9, 8, 3), np.nan, "f4")), "cube_content_invalid"),
         ("x.npy", npy(np.zeros((9, 8, 3), "u2")), "cube_content_invalid"),
         ("x.npy", npy(good)[:-9], "cube_truncated"), ("x.npy", npy(good[0]), "cube_format_unknown"),
-        ("x.h5", b"no HDF5", "cube_format_unknown"), ("x.mat", b"MATLAB 5.0 MAT-file" + bytes(200), "cube_format_unknown"),
+        ("x.h5", b"no HDF5", "cube_format_unknown"),
+        ("x.mat", b"MATLAB 5.0 MAT-file" + bytes(200), "cube_format_unknown"),
     ):  # fmt: skip
         file = sent(client, acquisition, "cube", name, data)
         assert (file["state"], file["judgement"]["code"]) == ("refused", code), name
@@ -130,8 +132,9 @@ def test_references_must_fit_the_cube(service: Running) -> None:
     acquisition = new_acquisition(client)
     sent(client, acquisition, "dark", "d.npy", npy(random_values("u2", (3, 20, 8))))
     sent(client, acquisition, "cube", "c.npy", npy(random_values("u2", (30, 20, 8))))
-    assert "The dark reference has no white one beside it." in (
-        client.get(f"/v1/acquisitions/{acquisition}").json()["missing"]
+    assert (
+        "The dark reference has no white one beside it."
+        in (client.get(f"/v1/acquisitions/{acquisition}").json()["missing"])
     )
     other = sent(client, acquisition, "white", "w.npy", npy(random_values("u2", (3, 20, 9))))
     assert (other["state"], other["judgement"]["code"]) == ("refused", "cube_content_invalid")

@@ -32,7 +32,7 @@ def test_tuspy_sends_a_photo_and_a_cube(service: Running, slash: str, checksum: 
                 file_stream=stream, chunk_size=1_000_000, metadata=fields, upload_checksum=checksum
             )  # fmt: skip
             uploader.upload()
-        told = result(client, uploader.url.removeprefix(service.url))
+        told = result(client, str(uploader.url).removeprefix(service.url))
         assert told["file"]["judgement"]["verdict"] == "accepted"
         assert told["file"]["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
     counts = client.get(f"/v1/acquisitions/{acquisition}").json()["files"]
@@ -47,14 +47,14 @@ def js_client(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("tus_client")
     for name in ("package.json", "package-lock.json", "upload.js"):
         shutil.copy(JS_CLIENT / name, folder / name)
-    subprocess.run(
-        ["npm", "ci", "--no-audit", "--no-fund"], cwd=folder, check=True, capture_output=True, timeout=180
-    )
+    subprocess.run(["npm", "ci", "--no-audit", "--no-fund"], cwd=folder, check=True, capture_output=True, timeout=180)
     return folder
 
 
 @pytest.mark.parametrize("chunk", [0, 1_500_000])
-def test_tus_js_client_goes_on_where_the_network_broke(service: Running, js_client: Path, chunk: int, tmp_path: Path) -> None:
+def test_tus_js_client_goes_on_where_the_network_broke(
+    service: Running, js_client: Path, chunk: int, tmp_path: Path
+) -> None:
     data = np.random.default_rng(0).bytes(8_000_000)
     file = tmp_path / "cube.raw"
     file.write_bytes(data)

@@ -147,7 +147,37 @@ def test_a_storage_that_fails_at_the_end_keeps_the_bytes(service: Running, monke
     assert result(client, at)["state"] == "finished"
 
 
-def test_two_clients_at_once(service: Running) -> None:
+@pytest.mark.parametrize(
+    ("number", "status", "code"), [(errno.ENOSPC, 507, "storage_full"), (errno.EIO, 503, "storage_unavailable")]
+)
+def test_writes_that_fail_are_told(
+    service: Running, monkeypatch: pytest.MonkeyPatch, number: int, status: int, code: str
+) -> None:
+    data = noise(3_000_000)
+    client = service.client()
+    at = created(client, new_acquisition(client), "cube", len(data), "x.raw")
+    write, left = os.write, [1_300_000]
+
+    def failing(handle: int, piece: bytes) -> int:
+        if len(piece) < 1000:  # not the upload's
+            return write(handle, piece)
+        if not left[0]:
+            raise OSError(number, os.strerror(number))
+        done = write(handle, piece[: left[0]])
+        left[0] -= done
+        return done
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "write", failing)
+        failed = patch(client, at, data[:1_900_000], 0)
+    assert (failed.status_code, failed.json()["code"]) == (status, code)
+    assert offset_of(client, at) == 1_300_000
+    assert patch(client, at, data[1_300_000:], 1_300_000).status_code == 204
+    assert result(client, at)["file"]["sha256"] == hashlib.sha256(data).hexdigest()
+
+
+def test_two_clients_at_once(service: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tus_store, "LOCK_SECONDS", 0.5)
     client, second = service.client(), service.client()
     data = noise(6_000_000)
     at = created(client, new_acquisition(client), "cube", len(data), "x.raw")

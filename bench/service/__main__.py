@@ -5,35 +5,20 @@ from __future__ import annotations
 import os
 import tempfile
 from argparse import ArgumentParser
-from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
 from bench.machine import describe, in_words
 from bench.record import keep
-from bench.service.clouds import bench_cloud, sheet_cloud
-from bench.service.jobs import bench_jobs, sheet_jobs
 from bench.service.options import Options
-from bench.service.peer import NO_NGINX, nginx_version
-from bench.service.shard import bench_shard, sheet_shard
-from bench.service.sheet import Sheet
-from bench.service.spectrum import bench_spectrum, sheet_spectrum
-from bench.service.upload import bench_upload, sheet_upload
+from bench.service.parts import PARTS
+from bench.service.peer import NO_NGINX, NO_TILED, nginx_version, tiled_version
 
 PACKAGES = ("fastapi", "starlette", "uvicorn", "uvloop", "httptools", "dbos", "sqlalchemy", "zarr", "obstore", "httpx")
 WIDTH = 130
 """Columns where the output is not a terminal."""
-Part = tuple[Callable[[Path, Options], dict[str, Any]], Callable[[dict[str, Any]], list[Sheet]]]
-PARTS: dict[str, Part] = {
-    "spectrum": (bench_spectrum, sheet_spectrum),
-    "cloud": (bench_cloud, sheet_cloud),
-    "shard": (bench_shard, sheet_shard),
-    "upload": (bench_upload, sheet_upload),
-    "jobs": (bench_jobs, sheet_jobs),
-}
 
 
 def machine() -> dict[str, object]:
@@ -41,7 +26,9 @@ def machine() -> dict[str, object]:
     found = describe()
     versions = found["versions"]
     assert isinstance(versions, dict)
-    found["versions"] = versions | {name: version(name) for name in PACKAGES} | {"nginx": nginx_version()}
+    found["versions"] = (
+        versions | {name: version(name) for name in PACKAGES} | {"nginx": nginx_version(), "tiled": tiled_version()}
+    )
     return found
 
 
@@ -63,12 +50,14 @@ def main() -> None:
     console.print(", ".join(f"{name} {versions[name]}" for name in versions if versions[name]), highlight=False)
     if nginx_version() is None:
         console.print(NO_NGINX, highlight=False)
+    if tiled_version() is None:
+        console.print(NO_TILED, highlight=False)
     with tempfile.TemporaryDirectory(prefix="specimap-bench-") as scratch:
         for name in given.only or PARTS:
             bench, sheets = PARTS[name]
             before = machine()
             figures = bench(Path(scratch), options)
-            figures["load_after"] = round(os.getloadavg()[0], 2)
+            figures |= {"repeats": options.repeats, "load_after": round(os.getloadavg()[0], 2)}
             for sheet in sheets(figures):
                 sheet.show(console)
             console.print(f"Kept in {keep(f'service-{name}', figures, before)}", highlight=False, soft_wrap=True)

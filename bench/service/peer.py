@@ -1,4 +1,8 @@
-"""nginx on the same files: the bar for whoever sends bytes."""
+"""Other servers on the same files: nginx, the bar for whoever sends bytes; Tiled, which serves arrays over HTTP.
+
+Both are found in PATH, are started on a free port with all they write in a folder of their own, and are left out where
+they are missing.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +12,14 @@ import shutil
 import socket
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-START_SECONDS = 10
+START_SECONDS = 60
+NO_NGINX = "nginx is not in PATH: its columns are empty (Debian, Ubuntu: apt install nginx-light)."
+NO_TILED = "tiled is not in PATH and left out (pip install 'tiled[server]', best in an environment of its own)."
 CONFIG = """\
 daemon off;
 worker_processes auto;
@@ -42,24 +48,24 @@ http {{
 """
 
 
+Address = tuple[str, int]
+
+
 @dataclass(frozen=True)
 class Nginx:
     """An nginx that serves ``root`` and takes files by PUT below ``/put/``."""
 
-    address: tuple[str, int]
+    address: Address
     root: Path
 
 
 def nginx_version() -> str | None:
     """``nginx/1.22.1``; None where none is in PATH."""
-    program = shutil.which("nginx") or shutil.which("nginx", path="/usr/sbin:/usr/local/sbin")
+    program = _nginx()
     if program is None:
         return None
     said = subprocess.run([program, "-v"], capture_output=True, text=True, check=False).stderr
     return said.rpartition(": ")[2].strip()
-
-
-NO_NGINX = "nginx is not in PATH: its columns are empty (Debian, Ubuntu: apt install nginx-light)."
 
 
 @contextmanager
@@ -68,22 +74,55 @@ def nginx(root: Path, work: Path) -> Iterator[Nginx | None]:
 
     Gives None where there is no nginx. Raises RuntimeError where it does not start.
     """
-    program = shutil.which("nginx") or shutil.which("nginx", path="/usr/sbin:/usr/local/sbin")
+    program = _nginx()
     if program is None:
         yield None
         return
     work.mkdir(parents=True)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = _free_port()
     # Started by root, its workers would become somebody who may not look into a temporary folder.
     user = f"user {pwd.getpwuid(os.geteuid()).pw_name};" if os.geteuid() == 0 else ""
     config = work / "nginx.conf"
     config.write_text(CONFIG.format(work=work, user=user, port=port, root=root), encoding="utf-8")
-    process = subprocess.Popen(
-        [program, "-p", str(work), "-e", str(work / "error.log"), "-c", str(config)],
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
+    command = [program, "-p", str(work), "-e", str(work / "error.log"), "-c", str(config)]
+    with _running(command, port, work / "error.log"):
+        yield Nginx(("127.0.0.1", port), root)
+
+
+@contextmanager
+def tiled(group: Path, work: Path) -> Iterator[Address | None]:
+    """Serve a Zarr group as ``cloud`` until the block ends; None where there is no Tiled. As :func:`nginx`."""
+    program = shutil.which("tiled")
+    if program is None:
+        yield None
+        return
+    shutil.copytree(group, work / "root" / "cloud.zarr", copy_function=os.link)
+    port = _free_port()
+    command = [program, "serve", "directory", "--public", "--port", str(port), str(work / "root")]
+    with _running(command, port, work / "tiled.log"):
+        deadline = time.monotonic() + START_SECONDS
+        # It listens before it has walked the folder.
+        while "Indexing complete" not in (work / "tiled.log").read_text(encoding="utf-8"):
+            if time.monotonic() > deadline:
+                raise RuntimeError(f"tiled does not start:\n{_end_of(work / 'tiled.log')}")
+            time.sleep(0.1)
+        yield "127.0.0.1", port
+
+
+def tiled_version() -> str | None:
+    """``0.2.20``; None where none is in PATH."""
+    program = shutil.which("tiled")
+    if program is None:
+        return None
+    said = subprocess.run([program, "--version"], capture_output=True, text=True, check=False).stdout
+    return said.strip().rpartition(" ")[2]
+
+
+@contextmanager
+def _running(command: Sequence[str], port: int, log: Path) -> Iterator[None]:
+    """A server until the block ends, once its port answers. Raises RuntimeError where it does not."""
+    with open(log, "ab") as output:
+        process = subprocess.Popen(command, stdout=output, stderr=output, env={**os.environ, "HOME": str(log.parent)})
     try:
         deadline = time.monotonic() + START_SECONDS
         while True:
@@ -92,10 +131,24 @@ def nginx(root: Path, work: Path) -> Iterator[Nginx | None]:
                 break
             except OSError as error:
                 if process.poll() is not None or time.monotonic() > deadline:
-                    said = (work / "error.log").read_text(encoding="utf-8")[-2000:]
-                    raise RuntimeError(f"nginx does not start:\n{said}") from error
+                    raise RuntimeError(f"{command[0]} does not start:\n{_end_of(log)}") from error
                 time.sleep(0.02)
-        yield Nginx(("127.0.0.1", port), root)
+        yield
     finally:
         process.terminate()
         process.wait()
+
+
+def _nginx() -> str | None:
+    # Debian keeps it where only root looks.
+    return shutil.which("nginx") or shutil.which("nginx", path="/usr/sbin:/usr/local/sbin")
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _end_of(log: Path) -> str:
+    return log.read_text(encoding="utf-8", errors="replace")[-2000:]

@@ -32,8 +32,9 @@ class Sheet:
             console.print(note, highlight=False)
 
     def markdown(self) -> str:
-        """The same for a document; its heading stands there."""
-        lines = [_line(self.headings), _line(["---", *["---:"] * (len(self.headings) - 1)])]
+        """The same for a document."""
+        lines = [f"{self.title}:", ""] if self.title else []
+        lines += [_line(self.headings), _line(["---", *["---:"] * (len(self.headings) - 1)])]
         lines += [_line(row) for row in self.rows]
         if self.notes:
             lines += ["", " ".join(self.notes)]

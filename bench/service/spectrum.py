@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from bench.service.options import Options
-from bench.service.peer import NO_NGINX, nginx, nginx_version
+from bench.service.peer import NO_NGINX, NO_TILED, nginx, nginx_version, tiled, tiled_version
 from bench.service.scene import put_result
 from bench.service.serving import Served, serving
 from bench.service.sheet import NONE, Sheet, reached
@@ -24,13 +24,13 @@ RATE_TARGET = 300.0
 NAMES = {
     "point": "`GET points/{i}`, JSON",
     "spectra": "`POST spectra`, one index, NumPy",
+    "tiled": "Tiled, one row of `spectra`, bytes",
     "file": "nginx, the same JSON as files",
-    "tiled": "Tiled, one row of the array, bytes",
 }
 
 
 def bench_spectrum(work: Path, options: Options) -> dict[str, Any]:
-    """Load the service, and nginx with the same answers as files."""
+    """Load the service, Tiled with the same array, and nginx with the service's answers as files."""
     with serving(work / "spectrum") as served:
         result = put_result(served, work)
         points = np.random.default_rng(0).integers(0, result.cloud.n_points, ASKED).tolist()
@@ -48,12 +48,19 @@ def bench_spectrum(work: Path, options: Options) -> dict[str, Any]:
             "bands": result.cloud.bands,
             "client": "one process, raw sockets, epoll",
             "nginx": nginx_version(),
+            "tiled": tiled_version(),
             "bytes": {name: _bytes(served.address, requests[0]) for name, requests in asked.items()},
             "runs": {},
         }
         for name, requests in asked.items():
             figures["runs"][name] = _levels(served.address, requests, options.repeats, served)
         _keep_answers(served, [f"{result.path}/points/{i}" for i in points], work / "answers")
+        with tiled(result.group, work / "tiled") as other:
+            if other is not None:
+                octets = {"Accept": "application/octet-stream"}
+                rows = [request(other, f"/api/v1/array/full/cloud/spectra?slice={i},:", octets) for i in points]
+                figures["bytes"]["tiled"] = _bytes(other, rows[0])
+                figures["runs"]["tiled"] = _levels(other, rows, options.repeats, None)
     with nginx(work / "answers", work / "nginx-spectrum") as peer:
         if peer is not None:
             files = [request(peer.address, f"/{number}.json") for number in range(ASKED)]
@@ -78,8 +85,10 @@ def sheet_spectrum(figures: dict[str, Any]) -> list[Sheet]:
                 )
             )  # fmt: skip
     sheet.notes.append("The client (one process, raw sockets) runs on the same cores; CPU is the API process's alone.")
-    if "file" not in figures["runs"]:
+    if figures["nginx"] is None:
         sheet.notes.append(NO_NGINX)
+    if figures["tiled"] is None:
+        sheet.notes.append(NO_TILED)
     levels = figures["runs"]["point"]
     p50 = min(run["p50_ms"] for run in levels["1"])
     rate = max(run["per_second"] for run in levels["64"])

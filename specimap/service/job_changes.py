@@ -19,18 +19,14 @@ from specimap.infra.models import (
     FINAL_STATES,
     PRIORITIES,
     Acquisition,
-    Artefact,
-    CloudRow,
-    Export,
     Job,
-    LabelVersion,
 )
 from specimap.infra.queue import JOBS, RUN_JOB, enqueue
 from specimap.infra.readiness import missing
-from specimap.infra.storage import Storage
 from specimap.infra.webhooks import check_target
 from specimap.service.context import AppContext, audit, correlation_id
 from specimap.service.job_models import JobRequest, RerunRequest, Webhook
+from specimap.service.removal import Leftovers
 
 
 def new_job(context: AppContext, key_id: str, wanted: JobRequest, idempotency_key: str | None) -> tuple[JobView, bool]:
@@ -164,44 +160,11 @@ def delete_job(context: AppContext, key_id: str, job_id: str) -> None:
         job = locked(session, job_id) or found_job(session, job_id)
         if job.state not in FINAL_STATES:
             raise JobConflictError(f"Job {job_id} is {job.state}.", advice="Cancel it first.", state=job.state)
-        acquisition, keys = job.acquisition_id, _own_keys(session, job_id)
-        needed = _needed_by_others(session, job_id)
-        session.execute(sa.delete(Artefact).where(Artefact.storage_key.startswith(f"jobs/{job_id}/", autoescape=True)))
+        acquisition, leftovers = job.acquisition_id, Leftovers.of(session, [job_id])
         session.execute(sa.delete(Job).where(Job.id == job_id))
         audit(session, key_id, "job.delete", job_id, acquisition=acquisition)
     _tell_engine(context.queue.delete_workflow, job_id)
-    for key in keys:
-        _remove(context.storage, key, needed)
-
-
-def _own_keys(session: Session, job_id: str) -> list[str]:
-    clouds = sa.select(CloudRow.id).where(CloudRow.job_id == job_id)
-    queries = (
-        sa.select(CloudRow.prefix).where(CloudRow.job_id == job_id),
-        sa.select(LabelVersion.storage_prefix).where(LabelVersion.cloud_id.in_(clouds)),
-        sa.select(Export.storage_key).where(Export.cloud_id.in_(clouds), Export.storage_key.is_not(None)),
-    )
-    return [f"jobs/{job_id}", *(key for query in queries for key in session.scalars(query) if key)]
-
-
-def _needed_by_others(session: Session, job_id: str) -> list[str]:
-    """Results of other jobs that stand on this one's files, since a stage that repeats nothing is not run again."""
-    own = sa.select(CloudRow.prefix).where(CloudRow.job_id == job_id)
-    query = sa.select(CloudRow.prefix).where(
-        CloudRow.job_id != job_id,
-        sa.or_(CloudRow.prefix.startswith(f"jobs/{job_id}/", autoescape=True), CloudRow.prefix.in_(own)),
-    )
-    return list(session.scalars(query))
-
-
-def _remove(storage: Storage, key: str, needed: list[str]) -> None:
-    kept = [other for other in needed if other == key or other.startswith(f"{key}/")]
-    if not kept:
-        storage.delete(key)
-        return
-    for file in list(storage.list(key)):
-        if not file.key.startswith(tuple(f"{other}/" for other in kept)):
-            storage.delete(file.key)
+    leftovers.remove(context)
 
 
 def _tell_engine(call: Callable[[str], None], job_id: str) -> None:

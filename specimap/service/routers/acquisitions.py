@@ -7,18 +7,19 @@ from typing import Annotated
 
 import sqlalchemy as sa
 from fastapi import APIRouter, Query
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 from sqlalchemy.orm import Session
 
 from specimap.infra.database import utc_now
 from specimap.infra.errors import JobConflictError
 from specimap.infra.ids import new_id
-from specimap.infra.models import FINAL_STATES, Acquisition, CloudRow, Job, StoredFile, Upload
+from specimap.infra.models import FINAL_STATES, Acquisition, Job, StoredFile, Upload
 from specimap.infra.readiness import missing
 from specimap.service.auth import Admin, Reader, Uploader
 from specimap.service.context import Context, audit
 from specimap.service.files import AcquisitionId, Dictionary, FileCounts, counts
-from specimap.service.paging import After, Limit, Page, page_of
+from specimap.service.paging import After, Limit, Moment, Page, page_of
+from specimap.service.removal import Leftovers
 from specimap.service.room import locked_acquisition, no_acquisition
 from specimap.service.routers.uploads import Files
 
@@ -80,8 +81,8 @@ def list_acquisitions(
     principal: Reader,
     specimen_id: Annotated[str | None, Query(max_length=64)] = None,
     accession_number: Annotated[str | None, Query(max_length=64)] = None,
-    created_after: Annotated[AwareDatetime | None, Query(description="Only those made at this time or later.")] = None,
-    created_before: Annotated[AwareDatetime | None, Query(description="Only those made before this time.")] = None,
+    created_after: Annotated[Moment | None, Query(description="Only those made at this time or later.")] = None,
+    created_before: Annotated[Moment | None, Query(description="Only those made before this time.")] = None,
     after: After = None,
     limit: Limit = 50,
 ) -> Page[AcquisitionView]:
@@ -119,15 +120,14 @@ def delete_acquisition(context: Context, principal: Admin, files: Files, acquisi
         row = locked_acquisition(session, acquisition_id)
         check_idle(session, acquisition_id)
         jobs = list(session.scalars(sa.select(Job.id).where(Job.acquisition_id == acquisition_id)))
-        clouds = list(session.scalars(sa.select(CloudRow.prefix).where(CloudRow.acquisition_id == acquisition_id)))
+        leftovers = Leftovers.of(session, jobs)
         open_uploads = list(session.scalars(sa.select(Upload.id).where(Upload.acquisition_id == acquisition_id)))
         session.delete(row)
         audit(session, principal.key_id, "acquisition.delete", acquisition_id, jobs=jobs)
-    # After the commit: rows that speak of files that are gone would be worse than files that nothing speaks of.
     for upload_id in open_uploads:
         files.remove(upload_id)
-    for prefix in (f"acquisitions/{acquisition_id}", *(f"jobs/{job_id}" for job_id in jobs), *clouds):
-        context.storage.delete(prefix)
+    context.storage.delete(f"acquisitions/{acquisition_id}")
+    leftovers.remove(context)
 
 
 def check_idle(session: Session, acquisition_id: str) -> None:

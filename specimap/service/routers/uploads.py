@@ -198,11 +198,15 @@ def _tell(context: AppContext, upload: Upload, exchange: tus.Exchange) -> None:
 # ---- setting up ---------------------------------------------------------------------------------------
 
 
-def _header(name: str, description: str, *, required: bool = True, kind: str = "string") -> dict[str, Any]:
-    return {"name": name, "in": "header", "required": required, "description": description, "schema": {"type": kind}}
-
-
-_TUS = _header("Tus-Resumable", "1.0.0")
+_BODY: dict[str, Any] = {
+    "requestBody": {"required": True, "content": {OCTETS: {"schema": {"type": "string", "format": "binary"}}}},
+    "parameters": [
+        {
+            "name": "Upload-Checksum", "in": "header", "required": False, "schema": {"type": "string"},
+            "description": "sha1, sha256 or md5 of the body, a space, and the digest in base64.",
+        }
+    ],
+}  # fmt: skip
 DOCUMENTED: dict[str, dict[str, Any]] = {
     "POST": {
         "summary": "Create an upload",
@@ -224,16 +228,16 @@ DOCUMENTED: dict[str, dict[str, Any]] = {
 
 
 def _document(route: APIRoute) -> None:
-    about = DOCUMENTED[next(iter(route.methods or ()))]
+    method = next(iter(route.methods or ()))
+    about = DOCUMENTED[method]
     status = str(route.status_code)
     route.summary, route.description = about["summary"], about["description"]
     route.response_class = Response
     # POST to an address that ends in a slash, as some clients do, is the same.
     route.include_in_schema = not route.path.endswith("/")
     answer = {name: {"schema": {"type": "string"}} for name in about["headers"]}
-    parameters = [_TUS]
-    extra: dict[str, Any] = {"parameters": parameters}
-    route.openapi_extra = extra
+    if method == "PATCH":
+        route.openapi_extra = _BODY
     route.responses = {status: {"description": about["summary"], "headers": answer}}
 
 

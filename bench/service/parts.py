@@ -1,0 +1,33 @@
+"""The parts of the benchmark: what measures each, and what tables it gives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from bench.machine import in_words
+from bench.service.clouds import bench_cloud, sheet_cloud
+from bench.service.jobs import bench_jobs, sheet_jobs
+from bench.service.options import Options
+from bench.service.shard import bench_shard, sheet_shard
+from bench.service.sheet import Sheet
+from bench.service.spectrum import bench_spectrum, sheet_spectrum
+from bench.service.upload import bench_upload, sheet_upload
+
+Figures = dict[str, Any]
+PARTS: dict[str, tuple[Callable[[Path, Options], Figures], Callable[[Figures], list[Sheet]]]] = {
+    "spectrum": (bench_spectrum, sheet_spectrum),
+    "cloud": (bench_cloud, sheet_cloud),
+    "shard": (bench_shard, sheet_shard),
+    "upload": (bench_upload, sheet_upload),
+    "jobs": (bench_jobs, sheet_jobs),
+}
+
+
+def in_markdown(part: str, record: dict[str, Any]) -> str:
+    """The tables of a kept record, and what they were measured on, for a document."""
+    figures, machine = record["figures"], record["machine"]
+    peer = f", {machine['versions']['nginx']}" if machine["versions"].get("nginx") else ""
+    tables = [sheet.markdown() for sheet in PARTS[part][1](figures)]
+    return "\n\n".join([*tables, f"{in_words(machine)}, {figures['load_after']} after{peer}; {record['time'][:10]}."])
