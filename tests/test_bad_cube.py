@@ -20,7 +20,7 @@ Values = NDArray[np.uint16]
 
 def rerun(small: OnDisk, out: Path, cube: Path) -> Report:
     report = run_pipeline(Inputs(small.photos, cube), out, PipelineSettings())
-    assert report.reused_stages == ["reconstruct", "adjust"]
+    assert report.reused_stages == ["reconstruct", "adjust", "render"]
     return report
 
 

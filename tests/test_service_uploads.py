@@ -5,11 +5,13 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import logging
 import threading
 from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
+import structlog
 from service_scene import Running, serving
 from upload_scene import (
     SAMPLES,
@@ -238,6 +240,7 @@ def test_names_stay_out_of_paths_and_logs(
     name = "../../etc/Müller \u202e\x00 geb. 1950.jpg"
     client = service.client()
     acquisition = new_acquisition(client)
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.DEBUG))
     with caplog.at_level("DEBUG"):
         at = created(client, acquisition, "photo", len(PHOTO), name)
         offset_of(client, at)

@@ -28,6 +28,7 @@ PARTS: dict[str, tuple[Callable[[Path, Options], Figures], Callable[[Figures], l
 def in_markdown(part: str, record: dict[str, Any]) -> str:
     """The tables of a kept record, and what they were measured on, for a document."""
     figures, machine = record["figures"], record["machine"]
-    peer = f", {machine['versions']['nginx']}" if machine["versions"].get("nginx") else ""
+    versions = machine["versions"]
+    peers = "".join(f", {name} {versions[name]}" for name in ("nginx", "tiled") if versions.get(name))
     tables = [sheet.markdown() for sheet in PARTS[part][1](figures)]
-    return "\n\n".join([*tables, f"{in_words(machine)}, {figures['load_after']} after{peer}; {record['time'][:10]}."])
+    return "\n\n".join([*tables, f"{in_words(machine)}, {figures['load_after']} after{peers}; {record['time'][:10]}."])

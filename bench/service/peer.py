@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 START_SECONDS = 60
+STOP_SECONDS = 10
 NO_NGINX = "nginx is not in PATH: its columns are empty (Debian, Ubuntu: apt install nginx-light)."
 NO_TILED = "tiled is not in PATH and left out (pip install 'tiled[server]', best in an environment of its own)."
 CONFIG = """\
@@ -31,7 +32,6 @@ http {{
     access_log {work}/access.log;
     default_type application/octet-stream;
     sendfile on;
-    tcp_nopush on;
     keepalive_requests 1000000000;
     client_max_body_size 0;
     client_body_temp_path {work}/body;
@@ -60,12 +60,12 @@ class Nginx:
 
 
 def nginx_version() -> str | None:
-    """``nginx/1.22.1``; None where none is in PATH."""
+    """``1.22.1``; None where none is in PATH."""
     program = _nginx()
     if program is None:
         return None
     said = subprocess.run([program, "-v"], capture_output=True, text=True, check=False).stderr
-    return said.rpartition(": ")[2].strip()
+    return said.rpartition("/")[2].strip()
 
 
 @contextmanager
@@ -136,7 +136,11 @@ def _running(command: Sequence[str], port: int, log: Path) -> Iterator[None]:
         yield
     finally:
         process.terminate()
-        process.wait()
+        try:
+            process.wait(STOP_SECONDS)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
 
 
 def _nginx() -> str | None:

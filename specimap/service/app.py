@@ -64,6 +64,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     app.state.context = context
     app.state.keyring = Keyring(context.database, settings.rate_per_minute, settings.quota_bytes)
     problems.install(app)
+    problems.describe(app)
     for module in (
         health, keys, acquisitions, files, uploads, jobs, clouds, zarr, spectra, previews, labels, exports,
     ):  # fmt: skip

@@ -71,6 +71,7 @@ class FormFiles:
         self._file: BinaryIO | None = None
         self._digest = hashlib.sha256()
         self._total = 0
+        self._ended = False
         self._state = _State()
 
     async def read(self, request: Request) -> list[Part]:
@@ -85,7 +86,6 @@ class FormFiles:
             raise RequestInvalidError(
                 "The body is no multipart form.", advice="Send multipart/form-data with `role` and `file`."
             )
-        ended = False
         try:
             parser = MultipartParser(options[b"boundary"], self._callbacks())
             buffer = bytearray()
@@ -97,11 +97,10 @@ class FormFiles:
                     await asyncio.to_thread(self._work_off)
             parser.write(bytes(buffer))
             parser.finalize()
-            ended = self._state.pending[-1:] == [("end", b"")]
             await asyncio.to_thread(self._work_off)
         except FormParserError as error:
             raise RequestInvalidError("The form does not read.", advice="Send multipart/form-data.") from error
-        if not ended or self._file is not None:
+        if not self._ended or self._file is not None:
             raise RequestInvalidError("The form is cut short.", advice="Send it again.")
         if not self.parts:
             raise RequestInvalidError("The form holds no file.", advice="Add the field `file`, after `role`.")
@@ -163,6 +162,8 @@ class FormFiles:
                     self._take(data)
                 elif what == "part end":
                     self._end_part()
+                elif what == "end":
+                    self._ended = True
 
     def _begin_file(self, name: str) -> None:
         if not self._role:

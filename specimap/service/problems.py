@@ -99,6 +99,24 @@ def install(app: FastAPI) -> None:
         )
 
 
+def describe(app: FastAPI) -> None:
+    """Leave out of the app's description what HTTP itself speaks of: a server answers a wrong one before the app."""
+    described = app.openapi
+
+    def openapi() -> dict[str, Any]:
+        contract = described()
+        for operations in contract["paths"].values():
+            for operation in operations.values():
+                given = operation.get("parameters", [])
+                operation["parameters"] = [p for p in given if p["name"].lower() not in OF_HTTP]
+        return contract
+
+    app.openapi = openapi  # type: ignore[method-assign]
+
+
+OF_HTTP = ("content-length", "content-type")
+
+
 _LEAVES: dict[int, type[SpecimapError]] = {
     404: NotFoundError,
     405: MethodNotAllowedError,
