@@ -11,6 +11,7 @@ VENV := .venv
 RUN := $(VENV)/bin
 STAMP := $(VENV)/.specimap-installed
 DEMO_OUT ?= out/demo
+TEST_PROCESSES ?= 3
 
 help:
 	@echo "make setup   install into $(VENV), pinned versions"
@@ -42,8 +43,9 @@ $(STAMP): pyproject.toml client/pyproject.toml requirements.lock | $(RUN)/python
 demo: setup
 	$(RUN)/specimap demo --out $(DEMO_OUT)
 
+# More processes than cores: many tests wait for servers, leases and clocks.
 test: setup
-	$(RUN)/python -m pytest
+	$(RUN)/python -m pytest -n $(TEST_PROCESSES) --dist worksteal
 
 lint: setup
 	$(RUN)/ruff check .

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -65,6 +66,27 @@ def test_every_operation_but_health_wants_a_key(contract: dict[str, Any], servic
             assert "{" not in path
             answer = stranger.request(method.upper(), path, headers={"Tus-Resumable": "1.0.0"})
             assert answer.status_code == 401, f"{method} {path}: {answer.status_code} {answer.text[:200]}"
+
+
+def test_pages_of_the_contract_fetch_nothing_from_elsewhere(service: Running) -> None:
+    with httpx.Client(base_url=service.url, trust_env=False) as reader:
+        for page in ("/docs", "/redoc"):
+            text = reader.get(page).text
+            places = re.findall(r'(?:src|href)="([^"]+)"', text)
+            assert len(places) >= 2
+            for place in places:
+                assert place.startswith("/static-offline-docs/"), place
+                assert len(reader.get(place).content) > 1000
+
+
+def test_corners_are_served_as_they_lie(service: Running, tmp_path: Path) -> None:
+    result = put_result(service, tmp_path / "result")
+    client = service.client(["read"])
+    links = client.get(f"/v1/clouds/{result.cloud_id}").json()["links"]
+    answer = client.get(links["corners"])
+    assert answer.content == (result.local / "corners.json").read_bytes()
+    assert answer.headers["content-type"] == "application/json"
+    assert client.get(links["corners"], headers={"If-None-Match": answer.headers["etag"]}).status_code == 304
 
 
 def test_every_body_has_an_example(contract: dict[str, Any]) -> None:

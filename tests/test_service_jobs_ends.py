@@ -12,7 +12,7 @@ from service_scene import Running
 from specimap.core.report import Report
 from specimap.infra import jobs
 from specimap.infra.ids import new_id
-from specimap.infra.models import Acquisition, Artefact, CloudRow, Delivery, Export, JobEvent, LabelVersion
+from specimap.infra.models import Acquisition, CloudRow, Delivery, Export, JobEvent, LabelVersion
 
 SPREAD = {"mean": 0.1, "std": 0.1, "n": 4}
 QUARTILES = {"median": 0.1, "q1": 0.1, "q3": 0.2, "n": 4}
@@ -120,27 +120,21 @@ def test_deleted_job_leaves_nothing(service: Running, final: str) -> None:
         with service.database.session() as session:
             jobs.claim(session, job_id, EXECUTOR)
             jobs.finish(session, job_id, EXECUTOR, final)  # type: ignore[arg-type]
-    service.storage.put(f"jobs/{job_id}/adjust/att_1/model.npz", b"1")
+    service.storage.put(f"jobs/{job_id}/register/att_1/report.json", b"1")
     with service.database.session() as session:
         session.add(Delivery(id=new_id("dlv"), job_id=job_id, state="pending"))
-        session.add(
-            Artefact(
-                id=new_id("att"), acquisition_id=owner, stage="adjust", key="k", size=1, seconds=1.0,
-                storage_key=f"jobs/{job_id}/adjust/att_1",
-            )
-        )  # fmt: skip
     assert service.client(("read", "upload", "label")).delete(f"/v1/jobs/{job_id}").status_code == 403
     assert client.delete(f"/v1/jobs/{job_id}").status_code == 204
     assert client.get(f"/v1/jobs/{job_id}").status_code == client.delete(f"/v1/jobs/{job_id}").status_code == 404
     assert list(service.storage.list(f"jobs/{job_id}")) == []
     with service.database.session() as session:
-        for table in (JobEvent, Delivery, Artefact):
+        for table in (JobEvent, Delivery):
             assert session.scalar(sa.select(sa.func.count()).select_from(table)) == 0
     assert service.app.state.context.queue.list_workflows() == []
     assert client.get("/v1/audit", params={"target": job_id}).json()["items"][0]["action"] == "job.delete"
 
 
-def test_deletion_takes_the_results_files_and_spares_those_of_others(service: Running) -> None:
+def test_deletion_takes_the_results_files_and_spares_those_of_others_and_of_the_acquisition(service: Running) -> None:
     owner = acquisition(service.database)
     job_id, cloud_id = succeeded(service, owner)
     with service.database.session() as session:
@@ -148,23 +142,27 @@ def test_deletion_takes_the_results_files_and_spares_those_of_others(service: Ru
         session.add(
             LabelVersion(
                 cloud_id=cloud_id, name="tumour", version=1, kind="class", classes=[], made_by={},
-                storage_prefix=f"labels/{cloud_id}/tumour/1", sha256="0", **made,
+                storage_prefix=f"clouds/{cloud_id}/labels/tumour/v1", sha256="0", **made,
             )
         )  # fmt: skip
+        export_id = new_id("exp")
         session.add(
             Export(
-                id=new_id("exp"), cloud_id=cloud_id, format="ply", state="succeeded", correlation_id="",
-                storage_key=f"exports/{cloud_id}/ply", **made,
+                id=export_id, cloud_id=cloud_id, format="ply", state="succeeded", correlation_id="",
+                storage_key=f"exports/{export_id}/cloud.ply", **made,
             )
         )  # fmt: skip
-    for key in (f"labels/{cloud_id}/tumour/1/values.npy", f"exports/{cloud_id}/ply"):
+    stage = f"acquisitions/{owner}/stages/att_1.npz"
+    for key in (f"clouds/{cloud_id}/labels/tumour/v1/zarr.json", f"exports/{export_id}/cloud.ply", stage):
         service.storage.put(key, b"1")
-    shared = f"jobs/{job_id}/register/att_shared"
-    other, _ = succeeded(service, owner, prefix=shared)
+    other, _ = succeeded(service, owner)
     client = service.client()
     assert client.delete(f"/v1/jobs/{job_id}").status_code == 204
-    left = [file.key for top in ("jobs", "labels", "exports") for file in service.storage.list(top)]
-    assert left == [f"{shared}/report.json"]
+    left = [file.key for top in ("jobs", "clouds", "exports", "acquisitions") for file in service.storage.list(top)]
+    assert len(left) == 2
+    assert left[0].startswith(f"jobs/{other}/")
+    # For the next run on the same files.
+    assert left[1] == stage
     assert client.get(f"/v1/jobs/{other}/report").status_code == 200
     assert client.delete(f"/v1/jobs/{other}").status_code == 204
     assert list(service.storage.list("jobs")) == []

@@ -199,7 +199,9 @@ def worker(
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for the results and the demo's service.")] = Path("out/demo"),
     samples: Annotated[Path, typer.Option(help="Folder of the sample that comes with the source.")] = Path("samples"),
-    stay: Annotated[bool, typer.Option(help="Let the service go on until Ctrl-C.")] = False,
+    stay: Annotated[
+        bool | None, typer.Option(help="Let the service go on until Ctrl-C; by default on a terminal.")
+    ] = None,
     debug: Debug = False,
 ) -> None:
     """Run the sample through a service of its own: upload, job, progress, report, link."""
@@ -207,7 +209,7 @@ def demo(
     with _told(listener, debug):
         from specimap.cli.demo import demo as run_demo
 
-        run_demo(samples, out, listener, stay=stay, say=typer.echo)
+        run_demo(samples, out, listener, stay=sys.stdout.isatty() if stay is None else stay, say=typer.echo)
 
 
 @contextmanager

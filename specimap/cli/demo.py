@@ -56,7 +56,8 @@ def demo(samples: Path, out: Path, listener: Listener, *, stay: bool, say: Calla
             say(f"The service goes on: the API is described at {url}/docs, the demo's key is {key}")
             say("Ctrl-C ends it.")
             threading.Event().wait()
-    say(f"To serve these results again: SPECIMAP_DATA_DIR={out / 'service'} specimap serve")
+    say(f"To serve these results again: export SPECIMAP_DATA_DIR={out / 'service'}; specimap serve")
+    say("A key for it: specimap keys create --name me --scope admin")
 
 
 def _run(
@@ -103,7 +104,7 @@ def _again(code: str, message: str, advice: str) -> SpecimapError:
 def _service(folder: Path) -> Iterator[tuple[str, str]]:
     """A service on a folder and a free port: its address and a new administrator's key."""
     remove(folder)
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, mode=0o700)
     environment = {
         **{name: value for name, value in os.environ.items() if not name.startswith("SPECIMAP_")},
         "SPECIMAP_DATA_DIR": str(folder.absolute()), "SPECIMAP_PORT": "0", "SPECIMAP_MIN_FREE_BYTES": "0",

@@ -62,11 +62,14 @@ class Storage:
         """
         place = settings.storage_place
         with disk_errors(settings.scratch):
-            settings.scratch.mkdir(parents=True, exist_ok=True, mode=0o700)
+            # Each by itself: the folders above one that is made with its parents get the usual rights.
+            for private in (settings.data_dir, settings.scratch):
+                private.mkdir(parents=True, exist_ok=True, mode=0o700)
         if not place.startswith("s3://"):
             folder = Path(place).absolute()
             with disk_errors(folder):
-                (folder / TEMPORARY).mkdir(parents=True, exist_ok=True, mode=0o700)
+                for private in (folder, folder / TEMPORARY):
+                    private.mkdir(parents=True, exist_ok=True, mode=0o700)
             return cls(LocalStore(folder), folder, settings.scratch)
         bucket, _, prefix = place.removeprefix("s3://").partition("/")
         try:

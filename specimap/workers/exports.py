@@ -27,6 +27,7 @@ from specimap.infra.models import CloudRow, Export
 from specimap.infra.settings import ServiceSettings
 from specimap.infra.storage import Storage
 from specimap.workers.export_main import REFUSED
+from specimap.workers.processes import bare_environment
 
 POLL_SECONDS = 0.1
 HELD_SECONDS = 2.0
@@ -193,7 +194,9 @@ def _run_once(
         str(settings.stage_memory_bytes),
     ]  # fmt: skip
     # A session of its own: a kill reaches whatever it starts, and the terminal's signals do not reach it.
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, start_new_session=True, env=bare_environment()
+    )
     start = asked = time.monotonic()
     try:
         while True:

@@ -17,7 +17,13 @@ from specimap.infra.errors import StageTimeoutError
 
 COMMAND = (sys.executable, "-m", "specimap.workers.stage_main")
 LAST_LINES = 40
+SECRET = ("SPECIMAP_", "AWS_", "PG")
 LINE_LIMIT = 1 << 20
+
+
+def bare_environment() -> dict[str, str]:
+    """The environment without what it tells of database and storage: a process that reads uploads sees no password."""
+    return {name: value for name, value in os.environ.items() if not name.startswith(SECRET)}
 
 
 class StageCrashedError(Exception):
@@ -56,6 +62,7 @@ class StageProcess:
             limit=LINE_LIMIT,
             # A group of its own: a kill reaches whatever it starts, and the terminal's signals do not reach it.
             start_new_session=True,
+            env=bare_environment(),
         )
         return cls(process)
 

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, TextIO
 
-import httpx
 from dbos import DBOS, DBOSConfig
 
 from specimap.core.errors import SpecimapError
@@ -34,7 +33,7 @@ from specimap.infra.queue import (
 )
 from specimap.infra.settings import ServiceSettings
 from specimap.infra.storage import Storage
-from specimap.infra.webhooks import deliver_due
+from specimap.infra.webhooks import deliver_due, webhook_client
 from specimap.workers.exports import run_export
 from specimap.workers.job import STAGES, JobRun
 from specimap.workers.leases import LeaseKeeper
@@ -99,7 +98,7 @@ class Worker:
             logger().info("worker stopped", executor=self.executor)
 
     def _deliver_until_stopped(self) -> None:
-        with httpx.Client(timeout=10, trust_env=False, follow_redirects=False) as client:
+        with webhook_client() as client:
             swept = time.monotonic()
             while not self._stopping.wait(DELIVERY_SECONDS):
                 if time.monotonic() - swept > SWEEP_SECONDS:

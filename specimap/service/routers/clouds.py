@@ -7,13 +7,14 @@ from typing import Annotated
 
 import numpy as np
 import sqlalchemy as sa
-from fastapi import APIRouter, Path, Query
+from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from specimap.infra.models import Acquisition, CloudRow, Job
 from specimap.service.auth import Reader
 from specimap.service.context import Context
 from specimap.service.paging import After, Limit, Page, page_of
+from specimap.service.ranges import ranged_response
 
 router = APIRouter(prefix="/v1", tags=["clouds"])
 CloudId = Annotated[str, Path(pattern=r"^cloud_[0-9a-hjkmnp-tv-z]{26}$")]
@@ -90,5 +91,15 @@ def show_cloud(context: Context, principal: Reader, cloud_id: CloudId) -> CloudA
                 "labels": f"{here}/labels",
                 "exports": f"{here}/exports",
                 "mesh": f"{here}/exports/mesh-ply",
+                "corners": f"{here}/corners",
             },
         )
+
+
+@router.get(
+    "/clouds/{cloud_id}/corners", response_class=Response, responses={200: {"content": {"application/json": {}}}}
+)
+def get_corners(context: Context, principal: Reader, request: Request, cloud_id: CloudId) -> Response:
+    """The markers' corners: `{"<id>": [[x, y, z] * 4]}`, mm, in the marker frame."""
+    record = context.clouds.record(cloud_id)
+    return ranged_response(request, context.storage, f"{record.prefix}/corners.json", "application/json")
