@@ -29,7 +29,7 @@ VERSION = "1.0.0"
 EXTENSIONS = "creation,checksum,expiration,termination"
 ALGORITHMS = ("sha1", "sha256", "md5")
 BATCH = 1024 * 1024
-IN_MEMORY = 4 * BATCH
+IN_MEMORY = 8 * BATCH
 SILENT_SECONDS = 30.0
 """Silence in the middle of a body after which the connection counts as lost: a network that fell away says nothing."""
 
