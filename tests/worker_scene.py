@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -195,6 +196,20 @@ def shop(folder: Path, **given: object) -> Iterator[Shop]:
     finally:
         opened.stop()
         database.close()
+
+
+def assert_all_succeed(yard: Shop, ids: Sequence[str], seconds: float = 240) -> None:
+    """Wait for the end of all jobs that there are: those of ``ids``, each succeeded with one result."""
+
+    def ended() -> bool:
+        with yard.database.session() as session:
+            query = sa.select(sa.func.count()).select_from(Job).where(Job.state.in_(FINAL_STATES))
+            return session.scalar(query) == len(ids)
+
+    until(ended, seconds, "the end of all jobs")
+    with yard.database.session() as session:
+        assert Counter(session.scalars(sa.select(Job.state))) == {"succeeded": len(ids)}
+        assert Counter(session.scalars(sa.select(CloudRow.job_id))) == dict.fromkeys(ids, 1)
 
 
 def processes_of(words: Sequence[str]) -> list[int]:
