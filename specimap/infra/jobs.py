@@ -62,7 +62,7 @@ def report_progress(session: Session, job_id: str, executor: str, stage: Stage, 
     Raises:
         LostLeaseError: the job is not this executor's.
     """
-    job = _held(session, job_id, executor)
+    job = held(session, job_id, executor)
     job.stage, job.progress = stage, min(max(share, 0.0), 1.0) if math.isfinite(share) else 0.0
     _append(session, job, "progress", {"stage": stage, "progress": round(job.progress, 4)})
 
@@ -73,7 +73,7 @@ def log(session: Session, job_id: str, executor: str, level: Level, message: str
     Raises:
         LostLeaseError: the job is not this executor's.
     """
-    job = _held(session, job_id, executor)
+    job = held(session, job_id, executor)
     _append(session, job, "log", {"level": level, "message": message, "data": data})
 
 
@@ -90,7 +90,7 @@ def finish(
     Raises:
         LostLeaseError: the job is not this executor's.
     """
-    job = _held(session, job_id, executor)
+    job = held(session, job_id, executor)
     if seconds is not None:
         job.seconds = {stage: round(value, 3) for stage, value in seconds.items()}
     _change(session, job, state, executor=executor, error=error)
@@ -227,7 +227,12 @@ def _known(session: Session, job_id: str) -> Job:
     return job
 
 
-def _held(session: Session, job_id: str, executor: str) -> Job:
+def held(session: Session, job_id: str, executor: str) -> Job:
+    """The locked job, if it runs and is this executor's.
+
+    Raises:
+        LostLeaseError: it is not.
+    """
     job = locked(session, job_id)
     if job is None or job.executor != executor or job.state != "running":
         raise _lost(job_id, executor)

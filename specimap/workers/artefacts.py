@@ -12,9 +12,8 @@ import sqlalchemy as sa
 from specimap.core.errors import NotFoundError
 from specimap.core.pipeline.artefacts import Store
 from specimap.infra.database import Database
-from specimap.infra.errors import LostLeaseError
 from specimap.infra.ids import new_id
-from specimap.infra.jobs import locked
+from specimap.infra.jobs import held
 from specimap.infra.models import Artefact
 from specimap.infra.storage import Storage
 
@@ -73,9 +72,7 @@ class Artefacts:
         self.storage.put_file(storage_key, copy)
         try:
             with self.database.session() as session:
-                job = locked(session, job_id)
-                if job is None or job.executor != executor or job.state != "running":
-                    raise LostLeaseError(f"Job {job_id} is not {executor}'s any more.", advice="Stop working on it.")
+                job = held(session, job_id, executor)
                 of_stage = sa.and_(Artefact.acquisition_id == self.acquisition_id, Artefact.stage == stage)
                 old = list(session.scalars(sa.select(Artefact.storage_key).where(of_stage)))
                 session.execute(sa.delete(Artefact).where(of_stage))

@@ -133,9 +133,7 @@ class JobRun:
                 jobs.finish(session, self.job_id, self.executor, state, error, seconds)
                 return state
 
-        state = await self._thread(end)
-        self.clear()
-        return state
+        return await self._thread(end)
 
     def clear(self) -> None:
         """Remove the work folder."""
@@ -242,9 +240,7 @@ class JobRun:
 
     def _count_start(self) -> int:
         with self._database.session() as session:
-            job = jobs.locked(session, self.job_id)
-            if job is None or job.executor != self.executor or job.state != "running":
-                raise LostLeaseError(f"Job {self.job_id} is not {self.executor}'s any more.", advice="Stop.")
+            job = jobs.held(session, self.job_id, self.executor)
             job.starts += 1
             return job.starts
 
