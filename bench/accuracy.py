@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from bench.measure import Measured, measure
 from bench.real import APPLE, bench_apple
 from bench.sample import SAMPLE
-from specimap.core.accuracy import TruthComparison, compare_with_truth
-from specimap.core.cloud import Cloud
-from specimap.core.phantom import load_truth
-
-SPECIMEN = 1
+from specimap.core.accuracy import TruthComparison
+from specimap.core.evidence.truth import evenly, judge
 
 
 @dataclass(frozen=True)
@@ -44,23 +38,6 @@ def cases(data: Path | None) -> list[Case]:
             Case("phantom hard", data / "phantom_hard"),
         ]
     return found
-
-
-def evenly(items: Sequence[Path], share: float) -> list[Path]:
-    """A share of ``items``, those left out spread evenly."""
-    count = round(share * len(items))
-    return [items[k] for k in np.floor((np.arange(count) + 0.5) * len(items) / count).astype(int)]
-
-
-def judge(out: Path, folder: Path) -> TruthComparison:
-    """The cloud of a finished run in ``out`` against the truth in ``folder``."""
-    truth, cloud = load_truth(folder), Cloud.open(out / "cloud.zarr")
-    corners = json.loads((out / "corners.json").read_text(encoding="utf-8"))
-    both = [k for k, i in enumerate(truth.marker_ids) if str(i) in corners]
-    return compare_with_truth(
-        cloud.hsi_pixel, cloud.xyz, np.array([corners[str(truth.marker_ids[k])] for k in both]),
-        truth.marker_corners[both], truth.hsi_xyz.astype(float), truth.hsi_class == SPECIMEN,
-    )  # fmt: skip
 
 
 def bench_accuracy(console: Console, work: Path, repeats: int) -> dict[str, object]:

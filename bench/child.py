@@ -40,7 +40,7 @@ class _Steps:
 def _settings(options: Namespace) -> PipelineSettings:
     return settings_from(
         edge_mm=options.edge_mm, dictionary=options.dictionary, method=options.method, adjustment="rigid", r_pc=0.5,
-        r_reg=2.0, backend="colmap", working_px=1280,
+        r_reg=2.0, backend="colmap", features="auto", working_px=1280,
     )  # fmt: skip
 
 

@@ -25,7 +25,7 @@ def bench_apple(console: Console, folder: Path) -> dict[str, object]:
     """42 phone photos of an apple on a printed board: stages 1 and 2."""
     settings = settings_from(
         edge_mm=EDGE_MM, dictionary="DICT_7X7_1000", method="camera", adjustment="rigid", r_pc=0.5, r_reg=2.0,
-        backend="colmap", working_px=WORKING_PX,
+        backend="colmap", features="auto", working_px=WORKING_PX,
     )  # fmt: skip
     workers = os.cpu_count() or 1
     with tempfile.TemporaryDirectory() as scratch:

@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import sys
-import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -18,14 +13,8 @@ import typer
 from specimap import __version__
 from specimap.cli.keys import keys_app
 from specimap.cli.progress import Listener, json_listener, progress_listener
-from specimap.core.errors import CancelledError, NotFoundError, SpecimapError
-
-REFUSED = 2
-"""Exit status of a refused input."""
-FAILED = 1
-"""Exit status where the program itself failed: an error that nobody foresaw."""
-STOPPED = 130
-DEBUG_VARIABLE = "SPECIMAP_DEBUG"
+from specimap.cli.telling import Debug, stoppable, told
+from specimap.core.errors import NotFoundError
 
 app = typer.Typer(
     add_completion=False,
@@ -53,6 +42,16 @@ class Backend(StrEnum):
     """Reconstruction backends."""
 
     colmap = "colmap"
+    mast3r = "mast3r"
+    da3 = "da3"
+
+
+class Features(StrEnum):
+    """Features that locate photos which the markers leave open."""
+
+    auto = "auto"
+    sift = "sift"
+    aliked = "aliked"
 
 
 class Format(StrEnum):
@@ -72,11 +71,6 @@ class Kind(StrEnum):
     gpu = "gpu"
 
 
-Debug = Annotated[
-    bool, typer.Option("--debug", envvar=DEBUG_VARIABLE, help="Print the traceback of an unforeseen error.")
-]
-
-
 @app.command()
 def run(
     photos: Annotated[Path, typer.Option(help="Folder of the photos (JPEG, PNG, TIFF, HEIC).")],
@@ -94,21 +88,24 @@ def run(
     ),
     r_pc: Annotated[float, typer.Option(help="Cell of the fine grid, mm.")] = 0.5,
     r_reg: Annotated[float, typer.Option(help="Cell of the coarse grid, mm.")] = 2.0,
-    backend: Annotated[Backend, typer.Option(help="Reconstruction backend.")] = Backend.colmap,
+    backend: Annotated[Backend, typer.Option(help="Reconstruction backend; docs/backends.md.")] = Backend.colmap,
+    features: Annotated[
+        Features, typer.Option(help="Features that locate photos which the markers leave open.")
+    ] = Features.auto,
     working_px: Annotated[int, typer.Option(help="Longer side that larger photos are brought to.")] = 1280,
     json_events: Annotated[bool, typer.Option("--json", help="One JSON line per event instead of a bar.")] = False,
     debug: Debug = False,
 ) -> None:
     """Reconstruct, adjust, render, register; write cloud.zarr, mesh.ply, report.json, corners.json, preview.png."""
     listener: Listener = json_listener() if json_events else progress_listener()
-    with _told(listener, debug), _stoppable() as stop_asked:
+    with told(listener, debug), stoppable() as stop_asked:
         # Imported late: `specimap --help` and `specimap info` need none of the 3D libraries.
         from specimap.core.pipeline import Inputs, Outputs, run_pipeline
         from specimap.core.pipeline.settings import settings_from
 
         settings = settings_from(
             edge_mm=edge_mm, dictionary=dictionary, method=method.value, adjustment=adjustment.value, r_pc=r_pc,
-            r_reg=r_reg, backend=backend.value, working_px=working_px,
+            r_reg=r_reg, backend=backend.value, features=features.value, working_px=working_px,
         )  # fmt: skip
         with listener:
             report = run_pipeline(
@@ -128,7 +125,7 @@ def info(
     debug: Debug = False,
 ) -> None:
     """Print the report of a run."""
-    with _told(json_listener() if json_events else progress_listener(), debug):
+    with told(json_listener() if json_events else progress_listener(), debug):
         from specimap.cli.tables import print_report
         from specimap.core.report import Report
 
@@ -157,7 +154,7 @@ def export(
     debug: Debug = False,
 ) -> None:
     """Write the cloud in another format."""
-    with _told(json_listener() if json_events else progress_listener(), debug):
+    with told(json_listener() if json_events else progress_listener(), debug):
         from specimap.core.cloud import Cloud
         from specimap.core.export import export_cloud
 
@@ -176,7 +173,7 @@ def serve(
     debug: Debug = False,
 ) -> None:
     """Start the service: API and workers. Settings come from SPECIMAP_ variables; docs/settings.md lists them."""
-    with _told(progress_listener(), debug):
+    with told(progress_listener(), debug):
         from specimap.cli.serve import serve as run_service
 
         run_service(workers=worker, say=typer.echo)
@@ -189,7 +186,7 @@ def worker(
     debug: Debug = False,
 ) -> None:
     """Start workers for a service that runs elsewhere, on the same database and storage."""
-    with _told(progress_listener(), debug):
+    with told(progress_listener(), debug):
         from specimap.cli.serve import work
 
         work(slots=slots, kind=kind.value)
@@ -206,53 +203,10 @@ def demo(
 ) -> None:
     """Run the sample through a service of its own: upload, job, progress, report, link."""
     listener = progress_listener()
-    with _told(listener, debug):
+    with told(listener, debug):
         from specimap.cli.demo import demo as run_demo
 
         run_demo(samples, out, listener, stay=sys.stdout.isatty() if stay is None else stay, say=typer.echo)
-
-
-@contextmanager
-def _stoppable() -> Iterator[Callable[[], bool]]:
-    """Let SIGINT and SIGTERM ask for a stop at the next step; asked twice, the program ends at once."""
-    asked: list[int] = []
-
-    def stop(number: int, _: object) -> None:
-        asked.append(number)
-        signal.signal(number, signal.SIG_DFL)
-
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: bool(asked)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-@contextmanager
-def _told(listener: Listener, debug: bool) -> Iterator[None]:
-    """Tell of any error by its code and advice, never by a traceback, and exit accordingly."""
-    try:
-        yield
-    except SpecimapError as error:
-        if debug:
-            traceback.print_exc()
-        listener.refused(error)
-        raise typer.Exit(STOPPED if isinstance(error, CancelledError) else REFUSED) from None
-    except BrokenPipeError:
-        # Who reads the output has gone; Python would complain once more when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise typer.Exit(FAILED) from None
-    except Exception as error:
-        if debug:
-            traceback.print_exc()
-        listener.refused(
-            SpecimapError(
-                f"An error that Specimap does not know: {type(error).__name__}: {error}",
-                advice=f"Repeat with {DEBUG_VARIABLE}=1 and report what it prints. Finished stages are kept.",
-            )
-        )
-        raise typer.Exit(FAILED) from None
 
 
 def _version(asked: bool) -> None:

@@ -14,12 +14,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from specimap.cli.telling import REFUSED
 from specimap.core.errors import NotFoundError, SettingsError, SpecimapError
 
 if TYPE_CHECKING:
     from sqlalchemy.orm import Session
 
-REFUSED = 2
 AUDITED_AS = "cli"
 """Stands for the key in the audit trail: whoever reaches the database needs none."""
 

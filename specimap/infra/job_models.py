@@ -41,7 +41,12 @@ class JobSettings(BaseModel):
     )
     r_pc: float = Field(default=0.5, ge=0.05, le=20, allow_inf_nan=False, description="Cell of the fine grid, mm.")
     r_reg: float = Field(default=2.0, ge=0.05, le=20, allow_inf_nan=False, description="Cell of the coarse grid, mm.")
-    backend: Literal["colmap"] = Field(default="colmap", description="Reconstruction backend.")
+    backend: Literal["colmap", "mast3r", "da3"] = Field(
+        default="colmap", description="Reconstruction backend; the learned ones need weights on the worker."
+    )
+    features: Literal["auto", "sift", "aliked"] = Field(
+        default="auto", description="Features that locate photos which the markers leave open."
+    )
     working_px: int = Field(
         default=1280, ge=320, le=8192, description="Longer side that larger photos are brought to, pixels."
     )

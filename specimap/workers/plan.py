@@ -18,7 +18,8 @@ from specimap.infra.models import Acquisition, Job, StoredFile
 from specimap.infra.storage import Storage
 
 DEFAULTS: dict[str, Any] = {
-    "method": "camera", "adjustment": "rigid", "r_pc": 0.5, "r_reg": 2.0, "backend": "colmap", "working_px": 1280,
+    "method": "camera", "adjustment": "rigid", "r_pc": 0.5, "r_reg": 2.0, "backend": "colmap", "features": "auto",
+    "working_px": 1280,
 }  # fmt: skip
 
 

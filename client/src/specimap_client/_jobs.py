@@ -33,7 +33,8 @@ class Jobs:
         idempotency_key: str | None = None,
         **settings: Any,
     ) -> Job:
-        """Queue a job; ``settings`` are method, adjustment, r_pc, r_reg, backend and the others that the service knows.
+        """Queue a job; ``settings`` are method, adjustment, r_pc, r_reg, backend, features and what else the service
+        knows.
 
         Without an ``idempotency_key`` one is made, so that a lost answer does not start the job twice. Give your
         own where your program may crash between submitting and noting the job's id: the same key and request

@@ -9,13 +9,14 @@ from specimap.core.acquisition import AcquisitionSettings
 from specimap.core.adjust import AdjustSettings, Form
 from specimap.core.errors import SettingsError
 from specimap.core.fiducials import dictionary_named
-from specimap.core.reconstruct.backend import ReconstructSettings
+from specimap.core.reconstruct.backend import FeatureChoice, ReconstructSettings
 from specimap.core.refine import RefineSettings
 from specimap.core.register.register import Method, RegisterSettings
 from specimap.core.render import RenderSettings
 from specimap.core.surface import SurfaceSettings
 
-BACKENDS = ("colmap",)
+BACKENDS = ("colmap", "mast3r", "da3")
+FEATURES = ("auto", "sift", "aliked")
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,7 @@ class PipelineSettings:
                 )
         choices = {
             "backend": (self.reconstruct.backend, BACKENDS),
+            "features": (self.reconstruct.features, FEATURES),
             "method": (self.register.method, ("camera", "homography")),
             "adjustment": (self.adjust.form, ("rigid", "free")),
         }
@@ -75,6 +77,7 @@ def settings_from(
     r_pc: float,
     r_reg: float,
     backend: str,
+    features: str,
     working_px: int,
 ) -> PipelineSettings:
     """Settings of a run from the few that a person chooses, checked.
@@ -84,7 +87,9 @@ def settings_from(
     """
     settings = PipelineSettings(
         acquisition=AcquisitionSettings(working_px=working_px),
-        reconstruct=ReconstructSettings(dictionary=dictionary, edge_mm=edge_mm, backend=backend),
+        reconstruct=ReconstructSettings(
+            dictionary=dictionary, edge_mm=edge_mm, backend=backend, features=cast(FeatureChoice, features)
+        ),
         adjust=AdjustSettings(form=cast(Form, adjustment), edge_mm=edge_mm),
         render=RenderSettings(r_reg_mm=r_reg, r_pc_mm=r_pc),
         register=RegisterSettings(method=cast(Method, method)),

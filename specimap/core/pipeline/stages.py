@@ -37,9 +37,17 @@ GRID_MARGIN_MM = 4.0
 
 def backend_named(name: str) -> ReconstructionBackend:
     """The backend of that name; settings have been checked."""
+    if name == "mast3r":
+        from specimap.core.reconstruct.mast3r.backend import Mast3rBackend
+
+        return Mast3rBackend()
+    if name == "da3":
+        from specimap.core.reconstruct.da3.backend import Da3Backend
+
+        return Da3Backend()
     from specimap.core.reconstruct.colmap import ColmapBackend
 
-    return {"colmap": ColmapBackend}[name]()
+    return ColmapBackend()
 
 
 def reconstruct_stage(

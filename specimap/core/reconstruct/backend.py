@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,15 +26,18 @@ DICTIONARY_FACTOR = 3
 """Another dictionary must read this many times more markers than the given one."""
 
 Progress = Callable[[float], None]
+FeatureChoice = Literal["auto", "sift", "aliked"]
 
 
 @dataclass(frozen=True)
 class ReconstructSettings:
-    """Stage 1. ``dictionary``: the markers' family. ``edge_mm``: their edge. ``backend``: which backend."""
+    """Stage 1. ``dictionary``: the markers' family. ``edge_mm``: their edge. ``backend``: which backend.
+    ``features``: what locates photos that the markers leave open."""
 
     dictionary: str = "DICT_4X4_50"
     edge_mm: float = 6.8
     backend: str = "colmap"
+    features: FeatureChoice = "auto"
     depth: DepthSettings = field(default_factory=DepthSettings)
     seed: int = 0
 

@@ -1,0 +1,1 @@
+"""What the figures rest on: runs judged against truth, subsampling studies, validation."""
