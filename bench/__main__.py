@@ -1,4 +1,4 @@
-"""``python -m bench [--only sample|cube|photos|accuracy] [--repeats N]``."""
+"""``python -m bench [--only sample|cube|photos|accuracy|features] [--repeats N]``."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from rich.console import Console
 
 from bench.accuracy import bench_accuracy
 from bench.cube import bench_cube
+from bench.features import bench_features
 from bench.machine import describe, in_words
 from bench.photos import bench_photos
 from bench.record import keep
@@ -22,6 +23,7 @@ PARTS: dict[str, Part] = {
     "cube": bench_cube,
     "photos": bench_photos,
     "accuracy": bench_accuracy,
+    "features": bench_features,
 }
 
 WIDTH = 130

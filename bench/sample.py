@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bench.measure import Cost, Measured, measure
-from bench.published import CORNER_2D_MM, CORNER_3D_MM, STAGE_SECONDS
+from specimap.core.evidence.published import CORNER_2D_WORDS, CORNER_3D_WORDS, STAGE_SECONDS_WORDS
 
 SAMPLE = Path(__file__).resolve().parent.parent / "samples"
 
@@ -26,14 +26,14 @@ def bench_sample(console: Console, work: Path, repeats: int) -> dict[str, object
     for heading in ("stage", "wall s", "CPU s", "peak MB", "published s (A100, other specimens)"):
         table.add_column(heading, justify="left" if heading == "stage" else "right")
     for name, cost in best.stages.items():
-        table.add_row(name, *_cells(cost), STAGE_SECONDS.get(name, "-"))
+        table.add_row(name, *_cells(cost), STAGE_SECONDS_WORDS.get(name, "-"))
     table.add_section()
     table.add_row("whole", *_cells(best.whole), "-")
     console.print(table)
     said = best.result
     console.print(
-        f"2D corner error {said['corner_2d_mm']:.3f} mm (published {CORNER_2D_MM}), "
-        f"3D {said['corner_3d_mm']:.3f} mm (published {CORNER_3D_MM}).\n"
+        f"2D corner error {said['corner_2d_mm']:.3f} mm (published {CORNER_2D_WORDS}), "
+        f"3D {said['corner_3d_mm']:.3f} mm (published {CORNER_3D_WORDS}).\n"
         "Peak: memory of the process beyond mapped files and libraries.",
         highlight=False,
     )

@@ -6,13 +6,12 @@ They go between marks in these pages.
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 from typing import Any
 
 from bench.record import RESULTS
 from bench.service.parts import PARTS, in_markdown
-from specimap.core.files import write_text
+from specimap.core.evidence.marks import put
 
 ROOT = Path(__file__).resolve().parent.parent
 REAL = "apple"
@@ -72,17 +71,6 @@ def real_line(real: dict[str, Any]) -> str:
         f"standard deviation {100 * std / mean:.2f} %, corners {real['rms_px']:.2f} px RMS, mesh after "
         f"{real['seconds']:.0f} s."
     )
-
-
-def put(page: Path, mark: str, text: str) -> None:
-    """Replace what stands between ``<!-- mark -->`` and ``<!-- /mark -->`` of a page."""
-    old = page.read_text(encoding="utf-8")
-    new, count = re.subn(
-        rf"(<!-- {mark} -->\n).*?(<!-- /{mark} -->)", lambda m: f"{m[1]}{text}\n{m[2]}", old, flags=re.DOTALL
-    )
-    if count != 1:
-        raise ValueError(f"{page.name} has {count} places marked {mark}")
-    write_text(page, new)
 
 
 def main() -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import pytest
 from scenes import OnDisk, rotation_deg
 
 from specimap.core.acquisition import AcquisitionSettings, Photo, photo_paths, read_photos
 from specimap.core.geometry import Intrinsics, View, look_at
-from specimap.core.reconstruct.features import Locator, colmap_camera, extract, match, triangulate_pair
+from specimap.core.reconstruct.features import Sift, colmap_camera, extract, match, triangulate_pair
+from specimap.core.reconstruct.locating import Locator
 
 TARGET = np.array([0.0, 0.0, 3.0])
 
@@ -78,11 +81,32 @@ def test_a_photo_without_a_pose_is_located(photos: list[Photo], small: OnDisk) -
     views = small.truth.views
     photo = 6
     poses = {k: v.cam_from_world for k, v in enumerate(views) if k != photo}
-    answer = Locator(photos, views[0].intrinsics, poses, TARGET, 0).locate(photo)
+    answer = Locator(photos, views[0].intrinsics, poses, TARGET, 0, Sift(2)).locate(photo)
     assert answer is not None
     true = views[photo].cam_from_world
     assert 1e-3 < rotation_deg(answer.pose, true) < 3
     assert np.linalg.norm(answer.pose.centre - true.centre) < 8  # of 150 mm
+
+
+def test_stopping_is_heard_between_photos(photos: list[Photo], small: OnDisk) -> None:
+    class StopError(Exception):
+        pass
+
+    steps = 0
+
+    def tick() -> None:
+        nonlocal steps
+        steps += 1
+        if steps == 3:
+            raise StopError
+
+    views = small.truth.views
+    poses = {k: v.cam_from_world for k, v in enumerate(views) if k != 6}
+    before = threading.active_count()
+    with pytest.raises(StopError):
+        Locator(photos, views[0].intrinsics, poses, TARGET, 0, Sift(2), tick).locate(6)
+    assert steps == 3
+    assert threading.active_count() == before
 
 
 def test_a_photo_of_something_else_is_not_located(photos: list[Photo], small: OnDisk) -> None:
@@ -91,4 +115,4 @@ def test_a_photo_of_something_else_is_not_located(photos: list[Photo], small: On
     strange = [*photos, Photo("noise", noise, photos[0].full_size, None, None, 1.0, "n")]
     views = small.truth.views
     poses = {k: v.cam_from_world for k, v in enumerate(views)}
-    assert Locator(strange, views[0].intrinsics, poses, TARGET, 0).locate(len(photos)) is None
+    assert Locator(strange, views[0].intrinsics, poses, TARGET, 0, Sift(2)).locate(len(photos)) is None

@@ -82,6 +82,12 @@ class Photo:
         return np.asarray(cv2.cvtColor(self.image, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
+def stated_focal_px(photos: list[Photo]) -> float | None:
+    """Focal length in working pixels that most photos' EXIF states, None where most state none."""
+    stated = [p.focal_px for p in photos if p.focal_px]
+    return float(np.median(stated)) if len(stated) > len(photos) / 2 else None
+
+
 @dataclass(frozen=True)
 class Refusal:
     """A photo that is not used: its name, a stable code and the reason in a sentence."""

@@ -203,8 +203,15 @@ class CancelledError(SpecimapError, RuntimeError):
     code = "cancelled"
 
 
+class BackendFailedError(SpecimapError, RuntimeError):
+    """The process of a backend crashed or ran out of memory; details hold its last lines."""
+
+    code = "backend_failed"
+
+
 HTTP_STATUS: dict[type[SpecimapError], int] = {
     SpecimapError: 500,
+    BackendFailedError: 500,
     BackendUnavailableError: 503,
     CancelledError: 409,
     CloudDamagedError: 500,

@@ -10,7 +10,7 @@ from specimap.core.cloud import CloudPoints, Flag
 from specimap.core.geometry import Floats
 from specimap.core.raycast import RayCaster
 from specimap.core.register.register import GRAZING_DEG, Placement
-from specimap.core.uncertainty import UNSEEN_SIGMA_MM, point_sigma
+from specimap.core.uncertainty import UNSEEN_SIGMA_MM, point_sigma, step_height
 
 CARD_OVER_MARKER = 1.5
 """Edge of a card over that of its marker (10.2 mm over 6.8 mm in the published layout)."""
@@ -34,6 +34,17 @@ def on_card(xyz: NDArray[np.float32], corners: Floats) -> NDArray[np.bool_]:
     return found
 
 
+def worth_refining(vertices: NDArray[np.float32], corners: Floats) -> NDArray[np.bool_]:
+    """Whether vertices (V, 3) mm may be of the specimen or of a card: the plain tray is most of a mesh, and nobody
+    asks for its third digit."""
+    return np.asarray((vertices[:, 2] > _raised_mm(corners) / 2) | on_card(vertices, corners))
+
+
+def _raised_mm(corners: Floats) -> float:
+    """Height above the marker plane from which on something is the specimen."""
+    return SPECIMEN_HEIGHT_SHARE * float(np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0)))
+
+
 def on_specimen(
     pixels: NDArray[np.uint16], xyz: NDArray[np.float32], card: NDArray[np.bool_], corners: Floats
 ) -> NDArray[np.bool_]:
@@ -41,8 +52,7 @@ def on_specimen(
     with what touches it in the cube."""
     if not len(xyz):
         return np.zeros(0, bool)
-    diagonal = float(np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0)))
-    raised = (xyz[:, 2] > SPECIMEN_HEIGHT_SHARE * diagonal) & ~card
+    raised = (xyz[:, 2] > _raised_mm(corners)) & ~card
     shape = pixels.max(0).astype(int) + 1
     mask = np.zeros(shape, np.uint8)
     mask[pixels[raised, 0], pixels[raised, 1]] = 1
@@ -61,12 +71,14 @@ def cloud_points(
     corners: Floats,
     corner_sigma_mm: float,
     registration_mm: float,
+    pixel_mm: float,
     parallax_mm: NDArray[np.float32] | None = None,
 ) -> CloudPoints:
     """The cloud's points with their flags and standard deviations.
 
-    ``parallax_mm`` (S,): distance from where the solved camera puts the same pixels, where the places do not come
-    from it; it is an error of those places and counts in their standard deviation.
+    ``pixel_mm``: what a pixel of the cube spans on the specimen. ``parallax_mm`` (S,): distance from where the solved
+    camera puts the same pixels, where the places do not come from it; it is an error of those places and counts in
+    their standard deviation.
     """
     if (placement.triangle >= 0).all():
         depth_sigma = caster.interpolate(
@@ -74,7 +86,8 @@ def cloud_points(
         ).ravel()
     else:
         depth_sigma = np.full(len(placement.xyz), np.float32(np.median(sigma_of_vertex)))
-    sigma = point_sigma(depth_sigma, placement.incidence_deg, corner_sigma_mm, registration_mm)
+    step_mm = step_height(placement.pixels, placement.xyz[:, 2], pixel_mm)
+    sigma = point_sigma(depth_sigma, step_mm, corner_sigma_mm, registration_mm)
     if parallax_mm is not None:
         sigma = np.hypot(sigma, np.nan_to_num(parallax_mm, nan=UNSEEN_SIGMA_MM)).astype(np.float32)
     card = on_card(placement.xyz, corners)

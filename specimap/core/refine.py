@@ -1,9 +1,10 @@
 """Move a mesh to where the photos agree: each vertex along its normal, by photo-consistency among many views.
 
 Pairwise depth is fused at the resolution of its matching windows and leans inward on bumps. Here, patches lying in
-the surface's own tangent plane are compared among up to five photos at once (mean pairwise normalised
+the surface's own tangent plane are compared among up to nine photos at once (mean pairwise normalised
 cross-correlation, as in multi-view stereo since Goesele et al. 2007) for a few offsets along the normal; the best
-offset, to a fraction of the step, is smoothed over neighbours by how sharply it is determined.
+offset, to a fraction of the step, is smoothed over neighbours by how sharply it is determined. A second, shorter
+pass starts from the normals that the first has put right.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 
 from specimap.core.geometry import Floats, Intrinsics, Pose
 from specimap.core.raycast import RayCaster
@@ -27,18 +28,38 @@ NOISE_VARIANCE = 4.0
 
 
 @dataclass(frozen=True)
+class Refined:
+    """A refined mesh, and how it came about.
+
+    ``views`` (V,): photos that were compared at a vertex, 0 where none were. ``unsettled_mm`` (V,): how far the
+    vertex's own photos would have it from where its neighbours let it go; NaN where it was not refined.
+    """
+
+    mesh: Mesh
+    views: NDArray[np.uint8]
+    unsettled_mm: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Pass:
+    """One round: the farthest offset ``reach_voxels``, how many ``steps`` are tried, ``views`` compared."""
+
+    reach_voxels: float
+    steps: int
+    views: int
+
+
+@dataclass(frozen=True)
 class RefineSettings:
     """Photo-consistent refinement.
 
-    ``views``: photos compared at a vertex. ``half_samples``: the patch is (2 n + 1)^2 samples, a photo's pixel
-    apart on the surface. ``reach_voxels``: farthest offset. ``steps``: offsets tried. ``least_score``: correlation
-    below which a vertex follows its neighbours. ``smoothness``: weight of the neighbours.
+    ``passes``: the rounds. ``half_samples``: the patch is (2 n + 1)^2 samples, a photo's pixel apart on the surface.
+    ``least_score``: correlation below which a vertex follows its neighbours. ``smoothness``: weight of the
+    neighbours.
     """
 
-    views: int = 5
+    passes: tuple[Pass, ...] = (Pass(2.0, 11, 9), Pass(0.8, 5, 9))
     half_samples: int = 2
-    reach_voxels: float = 2.0
-    steps: int = 11
     least_score: float = 0.3
     smoothness: float = 0.2
     smoothing_rounds: int = 10
@@ -59,17 +80,50 @@ def refine_mesh(
     settings: RefineSettings,
     *,
     workers: int,
+    worth: NDArray[np.bool_] | None = None,
     progress: Callable[[float], None] = lambda share: None,
-) -> Mesh:
-    """The mesh with its vertices moved along their normals; ``images`` (H, W) grey, in the order of ``poses``."""
-    points, normals = mesh.vertices.astype(float), mesh.normals.astype(float)
-    views = choose_views(mesh, lens, poses, settings)
-    progress(0.2)
-    reach = settings.reach_voxels * voxel_mm
-    offsets = np.linspace(-reach, reach, settings.steps)
-    sample_mm = pixel_footprint_mm(lens, poses, points.mean(0))
+) -> Refined:
+    """The mesh with its vertices moved along their normals; ``images`` (H, W) grey, in the order of ``poses``.
+
+    ``worth`` (V,): the vertices that are worth the time, all by default; the others keep their places.
+    """
+    chosen = np.arange(len(mesh.vertices)) if worth is None else np.flatnonzero(worth)
     greys = [image.astype(np.float32) for image in images]
-    scores = np.zeros((len(points), settings.steps), np.float32)
+    cost = [p.steps * p.views for p in settings.passes]
+    count = len(mesh.vertices)
+    refined = Refined(mesh, np.zeros(count, np.uint8), np.full(count, np.nan, np.float32))
+    for k, one in enumerate(settings.passes):
+        done, share = sum(cost[:k]) / sum(cost), cost[k] / sum(cost)
+        refined = _refined_once(
+            refined, chosen, greys, lens, poses, voxel_mm, settings, one, workers,
+            lambda s, done=done, share=share: progress(done + share * s),  # type: ignore[misc]
+        )  # fmt: skip
+    return refined
+
+
+def _refined_once(
+    start: Refined,
+    chosen: NDArray[np.int64],
+    greys: list[NDArray[np.float32]],
+    lens: Intrinsics,
+    poses: tuple[Pose, ...],
+    voxel_mm: float,
+    settings: RefineSettings,
+    one: Pass,
+    workers: int,
+    progress: Callable[[float], None],
+) -> Refined:
+    """One pass over the ``chosen`` vertices."""
+    mesh = start.mesh
+    points, normals = mesh.vertices[chosen].astype(float), mesh.normals[chosen].astype(float)
+    if not len(points):
+        return start
+    views = choose_views(mesh, chosen, lens, poses, one.views, settings.least_cosine)
+    progress(0.2)
+    reach = one.reach_voxels * voxel_mm
+    offsets = np.linspace(-reach, reach, one.steps)
+    sample_mm = pixel_footprint_mm(lens, poses, points.mean(0))
+    scores = np.zeros((len(points), one.steps), np.float32)
 
     def run(part: slice) -> None:
         scores[part] = _scores(
@@ -84,18 +138,37 @@ def refine_mesh(
     sure = ((views >= 0).sum(1) >= 3) & (scores.max(1) > settings.least_score)
     weight = np.where(sure, weight, 0.0)
     if not (weight > 0).any():
-        return mesh
+        return start
     weight = np.minimum(weight / np.median(weight[weight > 0]), 5.0)
-    moved = points + _smoothed(best, weight, mesh.triangles, settings)[:, None] * normals
-    vertices = moved.astype(np.float32)
-    return Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), mesh.colours)
+    offset, trust = np.zeros(len(mesh.vertices)), np.zeros(len(mesh.vertices))
+    offset[chosen], trust[chosen] = best, weight
+    moved = np.zeros(len(mesh.vertices))
+    moved[chosen] = _smoothed(offset, trust, mesh.triangles, settings)[chosen]
+    vertices = (mesh.vertices + moved[:, None] * mesh.normals).astype(np.float32)
+    compared, unsettled = start.views.copy(), start.unsettled_mm.copy()
+    compared[chosen] = (views >= 0).sum(1)
+    # One vertex's own disagreement is mostly chance; that of a few together tells how well a place is settled.
+    apart = np.zeros(len(moved))
+    apart[chosen] = np.abs(best - moved[chosen])
+    among = np.zeros(len(moved))
+    among[chosen] = 1.0
+    edges = _edges(mesh.triangles, len(moved))
+    unsettled[chosen] = (apart + edges @ apart)[chosen] / (among + edges @ among)[chosen]
+    after = Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), mesh.colours)
+    return Refined(after, compared, unsettled)
 
 
 def choose_views(
-    mesh: Mesh, lens: Intrinsics, poses: tuple[Pose, ...], settings: RefineSettings
+    mesh: Mesh,
+    chosen: NDArray[np.int64],
+    lens: Intrinsics,
+    poses: tuple[Pose, ...],
+    most: int,
+    least_cosine: float,
 ) -> NDArray[np.int64]:
-    """For each vertex the photos that see it most squarely and unhidden, (V, views); -1 where there are fewer."""
-    points, normals = mesh.vertices.astype(float), mesh.normals.astype(float)
+    """For each of the ``chosen`` (n,) vertices the photos that see it most squarely and unhidden, (n, most); -1 where
+    there are fewer."""
+    points, normals = mesh.vertices[chosen].astype(float), mesh.normals[chosen].astype(float)
     cosine = np.empty((len(poses), len(points)), np.float32)
     margin = 6
     for k, pose in enumerate(poses):
@@ -110,8 +183,8 @@ def choose_views(
         )
         cosine[k] = np.where(inside, facing, -1)
     # A few more candidates than needed, since some will be hidden.
-    order = np.argsort(-cosine, axis=0)[: settings.views + 3]
-    seen = np.take_along_axis(cosine, order, 0) > settings.least_cosine
+    order = np.argsort(-cosine, axis=0)[: most + 3]
+    seen = np.take_along_axis(cosine, order, 0) > least_cosine
     rank, vertex = np.nonzero(seen)
     centres = np.stack([p.centre for p in poses])
     away = centres[order[rank, vertex]] - points[vertex]
@@ -120,11 +193,11 @@ def choose_views(
     hidden = RayCaster(mesh).cast(points[vertex] + clearance, away).hit
     seen[rank[hidden], vertex[hidden]] = False
     place = np.cumsum(seen, axis=0)
-    seen &= place <= settings.views
-    chosen = np.full((len(points), settings.views), -1, np.int64)
+    seen &= place <= most
+    views = np.full((len(points), most), -1, np.int64)
     rank, vertex = np.nonzero(seen)
-    chosen[vertex, place[rank, vertex] - 1] = order[rank, vertex]
-    return chosen
+    views[vertex, place[rank, vertex] - 1] = order[rank, vertex]
+    return views
 
 
 def _scores(
@@ -192,12 +265,17 @@ def _best_offsets(scores: NDArray[np.float32], offsets: Floats) -> tuple[Floats,
     return offsets[middle] + shift * step, np.where(inner, -bend * np.maximum(centre, 0), 0.0)
 
 
-def _smoothed(best: Floats, weight: Floats, triangles: NDArray[np.int32], settings: RefineSettings) -> Floats:
-    """Offsets (V,) that follow ``best`` by ``weight`` and their neighbours for the rest (Jacobi rounds)."""
-    n = len(best)
+def _edges(triangles: NDArray[np.int32], n: int) -> csr_array:
+    """Which of ``n`` vertices share an edge, (n, n), 1 where they do."""
     a, b = triangles[:, [0, 1, 2]].ravel(), triangles[:, [1, 2, 0]].ravel()
     edges = coo_array((np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, a])), shape=(n, n)).tocsr()
     edges.data[:] = 1.0
+    return edges
+
+
+def _smoothed(best: Floats, weight: Floats, triangles: NDArray[np.int32], settings: RefineSettings) -> Floats:
+    """Offsets (V,) that follow ``best`` by ``weight`` and their neighbours for the rest (Jacobi rounds)."""
+    edges = _edges(triangles, len(best))
     degree = np.asarray(edges.sum(1)).ravel()
     out = np.where(weight > 0, best, 0.0)
     for _ in range(settings.smoothing_rounds):

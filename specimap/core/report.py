@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+import json
+from typing import Annotated
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+# JSON has no NaN: a figure that could not be had is null there.
+Figure = Annotated[float, BeforeValidator(lambda value: float("nan") if value is None else value)]
 
 
 class Section(BaseModel):
@@ -20,11 +26,11 @@ class Spread(Section):
 
 
 class Quartiles(Section):
-    """Median and quartiles of ``n`` values, mm."""
+    """Median and quartiles of ``n`` values, mm; NaN where ``n`` is 0."""
 
-    median: float
-    q1: float
-    q3: float
+    median: Figure
+    q1: Figure
+    q3: Figure
     n: int
 
 
@@ -126,6 +132,34 @@ class Coverage(Section):
     specimen_points: int
 
 
+Corners = Annotated[list[list[float]], Field(description="x, y of four corners a marker: eight numbers.")]
+
+
+class PhotoCorners(Section):
+    """Marker corners in a used photo, upright and at working size, pixel centres at integers; to 0.1 px.
+
+    ``residuals_px``: the adjusted corners, projected, less the measured ones; to 0.01 px.
+    """
+
+    name: str
+    width_px: int
+    height_px: int
+    marker_ids: list[int]
+    corners_px: Corners
+    residuals_px: Corners
+
+
+class CubeCorners(Section):
+    """Marker corners in the cube as it is stored, x along its columns, to 0.1 px; residuals of its solved camera, to
+    0.01 px."""
+
+    rows: int
+    cols: int
+    marker_ids: list[int]
+    corners_px: Corners
+    residuals_px: Corners
+
+
 class Report(Section):
     """Everything that is said about a result. Lengths in mm, angles in degrees, times in seconds."""
 
@@ -155,3 +189,27 @@ class Report(Section):
     warnings: list[Remark]
     settings: dict[str, object] = Field(default_factory=dict)
     inputs: dict[str, str] = Field(default_factory=dict)
+    photo_corners: list[PhotoCorners] | None = None
+    """Of each used photo, in the order of ``photos.used``; None in reports of versions that did not keep them."""
+    cube_corners: CubeCorners | None = None
+
+    def summary(self) -> dict[str, object]:
+        """As JSON values, without what report.json alone holds: readers of a cloud fetch its attributes first."""
+        return self.model_dump(mode="json", exclude=_DETAILS)
+
+    def text(self) -> str:
+        """The report as JSON for people and programs: a line a field, but a line a photo for the corners."""
+        head = self.model_dump_json(indent=1, exclude=_DETAILS)
+        if self.photo_corners is None:
+            return head
+        photos = ",\n".join(f"  {_compact(photo)}" for photo in self.photo_corners)
+        cube = "null" if self.cube_corners is None else _compact(self.cube_corners)
+        corners = f'"photo_corners": [\n{photos}\n ],\n "cube_corners": {cube}'
+        return f"{head.rstrip().removesuffix('}').rstrip()},\n {corners}\n}}"
+
+
+_DETAILS = {"photo_corners", "cube_corners"}
+
+
+def _compact(section: Section) -> str:
+    return json.dumps(section.model_dump(mode="json"), separators=(",", ":"), ensure_ascii=False)

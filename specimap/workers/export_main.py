@@ -23,7 +23,7 @@ REFUSED = 2
 
 
 def make_export_file(cloud_folder: Path, format: str, target: Path) -> Path:
-    """Write a result, a folder with ``cloud.zarr`` and ``mesh.ply``, to ``target`` in a format of
+    """Write a result, a folder with ``cloud.zarr``, ``mesh.ply`` and ``report.json``, to ``target`` in a format of
     :class:`~specimap.core.export.formats.FileFormat`; whole or not at all.
 
     Raises:
@@ -42,7 +42,9 @@ def make_export_file(cloud_folder: Path, format: str, target: Path) -> Path:
             return write_zarr_zip(Cloud.open(cloud_folder / "cloud.zarr"), target)
         case FileFormat.ENVI:
             return write_envi_zip(Cloud.open(cloud_folder / "cloud.zarr"), target)
-        case FileFormat.PLY | FileFormat.LAS | FileFormat.NPZ | FileFormat.CSV as other:
+        case (
+            FileFormat.PLY | FileFormat.LAS | FileFormat.NPZ | FileFormat.CSV | FileFormat.HTML | FileFormat.PDF
+        ) as other:
             return export_cloud(Cloud.open(cloud_folder / "cloud.zarr"), target, cast(ExportFormat, other.value))
 
 

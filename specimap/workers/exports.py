@@ -16,6 +16,7 @@ from uuid import uuid4
 
 import sqlalchemy as sa
 
+from specimap.core.cloud.schema import ARRAYS
 from specimap.core.errors import CancelledError, NotFoundError, SpecimapError
 from specimap.core.export.formats import FileFormat, file_name
 from specimap.core.files import disk_errors, remove
@@ -29,6 +30,7 @@ from specimap.infra.storage import Storage
 from specimap.workers.export_main import REFUSED
 from specimap.workers.processes import bare_environment
 
+DOCUMENTS = (FileFormat.HTML, FileFormat.PDF)
 POLL_SECONDS = 0.1
 HELD_SECONDS = 2.0
 """How often a running export's row is asked whether it still is this executor's."""
@@ -128,6 +130,9 @@ def _fetch(database: Database, storage: Storage, cloud_id: str, format: FileForm
     if format.startswith("mesh-"):
         storage.fetch(f"{cloud.prefix}/mesh.ply", work / "mesh.ply")
         return ""
+    if format in DOCUMENTS:
+        _fetch_drawn(storage, cloud.prefix, work)
+        return ""
     storage.fetch(f"{cloud.prefix}/cloud.zarr", work / "cloud.zarr")
     try:
         for label in labels:
@@ -140,6 +145,16 @@ def _fetch(database: Database, storage: Storage, cloud_id: str, format: FileForm
         remove(work / "cloud.zarr")
         return _fetch(database, storage, cloud_id, format, work)
     return fingerprint(labels) if format is FileFormat.ZARR else ""
+
+
+def _fetch_drawn(storage: Storage, prefix: str, work: Path) -> None:
+    """What a report is drawn from: all but the spectra, which are nearly all of a cloud."""
+    for name in ("zarr.json", "spectra/zarr.json", *(array for array in ARRAYS if array != "spectra")):
+        storage.fetch(f"{prefix}/cloud.zarr/{name}", work / "cloud.zarr" / name)
+    storage.fetch(f"{prefix}/report.json", work / "report.json")
+    for name in ("photos.jpg", "preview.png"):  # older results have no photos
+        with suppress(NotFoundError):
+            storage.fetch(f"{prefix}/{name}", work / name)
 
 
 def _make(

@@ -33,7 +33,8 @@ Value = TypeVar("Value")
 PROGRESS_SECONDS = 0.4
 """Least time between two progress events of a stage: a person sees no more, and each is a transaction."""
 RESULTS = ("cloud.zarr", "mesh.ply", "corners.json", "preview.png", "report.json")
-
+SHEET = "photos.jpg"
+"""Not there where stage 1 was kept from a version that made none."""
 
 
 class JobRun:
@@ -182,7 +183,7 @@ class JobRun:
 
     def _publish(self, prefix: str) -> tuple[int, int]:
         with self._storage.publishing(prefix) as aside, disk_errors(aside):
-            for name in RESULTS:
+            for name in (*RESULTS, *([SHEET] if (self._out / SHEET).exists() else [])):
                 shutil.move(self._out / name, aside / name)
             size = sum(p.stat().st_size for p in aside.rglob("*") if p.is_file())
             # Read here, since it is at hand: the report does not say it.

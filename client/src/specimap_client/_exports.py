@@ -13,7 +13,9 @@ from specimap_client._errors import ExportFailed, Timeout
 from specimap_client._http import Session, path
 from specimap_client._models import Export, Progress
 
-Format = Literal["mesh-ply", "mesh-stl", "mesh-obj", "mesh-glb", "ply", "las", "npz", "envi", "zarr", "csv"]
+Format = Literal[
+    "mesh-ply", "mesh-stl", "mesh-obj", "mesh-glb", "ply", "las", "npz", "envi", "zarr", "csv", "html", "pdf"
+]
 _PAUSES = (0.1, 0.25, 0.5, 1.0, 2.0)
 
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from specimap.core.accuracy import TruthComparison, compare_with_truth
 from specimap.core.cloud import Cloud
@@ -22,12 +24,41 @@ def evenly(items: Sequence[Path], share: float) -> list[Path]:
     return [items[k] for k in np.floor((np.arange(count) + 0.5) * len(items) / count).astype(int)]
 
 
+def some(items: Sequence[Path], share: float, seed: int) -> list[Path]:
+    """A random share of ``items`` in their order; the same ``seed`` gives the same."""
+    count = round(share * len(items))
+    chosen = np.random.default_rng([seed, count]).choice(len(items), count, replace=False)
+    return [items[k] for k in np.sort(chosen)]
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A run's ``errors`` against truth and ``sigma_mm`` (n,), the stated standard deviation of the same points."""
+
+    errors: TruthComparison
+    sigma_mm: NDArray[np.float32]
+
+    def within(self, sigmas: float) -> float:
+        """Share of the errors within so many stated standard deviations."""
+        return float((self.errors.errors_mm <= sigmas * self.sigma_mm).mean())
+
+
 def judge(out: Path, folder: Path) -> TruthComparison:
     """The cloud of a finished run in ``out`` against the truth in ``folder``."""
+    return judge_with_sigma(out, folder).errors
+
+
+def judge_with_sigma(out: Path, folder: Path) -> Judged:
+    """As :func:`judge`, with what the run itself says of its errors."""
     truth, cloud = load_truth(folder), Cloud.open(out / "cloud.zarr")
     corners = json.loads((out / "corners.json").read_text(encoding="utf-8"))
     both = [k for k, i in enumerate(truth.marker_ids) if str(i) in corners]
-    return compare_with_truth(
-        cloud.hsi_pixel, cloud.xyz, np.array([corners[str(truth.marker_ids[k])] for k in both]),
-        truth.marker_corners[both], truth.hsi_xyz.astype(float), truth.hsi_class == SPECIMEN,
+    pixels, xyz, true_xyz = cloud.hsi_pixel, cloud.xyz, truth.hsi_xyz.astype(float)
+    # Errors come without the points that have no finite one: left out here, they leave sigma in step.
+    finite = np.isfinite(xyz).all(1) & np.isfinite(true_xyz[pixels[:, 0], pixels[:, 1]]).all(1)
+    on_it = finite & (truth.hsi_class[pixels[:, 0], pixels[:, 1]] == SPECIMEN)
+    errors = compare_with_truth(
+        pixels[on_it], xyz[on_it], np.array([corners[str(truth.marker_ids[k])] for k in both]),
+        truth.marker_corners[both], true_xyz, truth.hsi_class == SPECIMEN,
     )  # fmt: skip
+    return Judged(errors, cloud.sigma_mm[on_it])

@@ -1,4 +1,4 @@
-"""A spectral cloud as a file of another program: PLY, LAS, NPZ, ENVI, CSV.
+"""A spectral cloud as a file of another program: PLY, LAS, NPZ, ENVI, CSV; and the report on it: HTML, PDF.
 
 Every export is streamed in bounded memory and appears whole or not at all.
 """
@@ -17,7 +17,7 @@ from specimap.core.export.npz import write_npz
 from specimap.core.export.ply import write_ply
 from specimap.core.export.table import write_csv
 
-ExportFormat = Literal["ply", "las", "npz", "envi", "csv"]
+ExportFormat = Literal["ply", "las", "npz", "envi", "csv", "html", "pdf"]
 
 _Exporter = Callable[[Cloud, Path, float], Path]
 
@@ -27,6 +27,8 @@ EXPORTERS: dict[str, _Exporter] = {
     "npz": lambda cloud, target, _: write_npz(cloud, target),
     "envi": lambda cloud, target, grid_mm: write_envi(cloud, target, grid_mm=grid_mm),
     "csv": lambda cloud, target, _: write_csv(cloud, target),
+    "html": lambda cloud, target, _: _write_report(cloud, target, "html"),
+    "pdf": lambda cloud, target, _: _write_report(cloud, target, "pdf"),
 }
 """Another format is one function here."""
 
@@ -35,11 +37,12 @@ def export_cloud(cloud: Cloud, target: Path, format: ExportFormat, *, grid_mm: f
     """Write the cloud to ``target``, replacing it; the path written (ENVI: the header's).
 
     Spectra are in ``npz``, ``csv`` and, resampled on a top view of ``grid_mm``, ``envi``; ``ply`` and ``las``
-    hold the geometry, in the cloud's order, so that the n-th point's spectrum is the cloud's n-th.
+    hold the geometry, in the cloud's order, so that the n-th point's spectrum is the cloud's n-th. ``html`` and
+    ``pdf`` are the accuracy report, drawn from the files beside the cloud.
 
     Raises SettingsError for an unknown format or a grid that is not positive or far too fine,
-    BackendUnavailableError where a format's library is not installed, StorageFullError,
-    OutputNotWritableError, CloudDamagedError.
+    BackendUnavailableError where a format's library is not installed, NotFoundError where no report lies beside
+    the cloud, StorageFullError, OutputNotWritableError, CloudDamagedError.
     """
     exporter = EXPORTERS.get(format)
     if exporter is None:
@@ -50,3 +53,10 @@ def export_cloud(cloud: Cloud, target: Path, format: ExportFormat, *, grid_mm: f
             choices=list(EXPORTERS),
         )
     return exporter(cloud, target, grid_mm)
+
+
+def _write_report(cloud: Cloud, target: Path, format: Literal["html", "pdf"]) -> Path:
+    # Imported late: the other formats need no plotting library.
+    from specimap.core.document import write_document
+
+    return write_document(cloud.path.parent, target, format)

@@ -7,7 +7,7 @@ from enum import StrEnum
 
 
 class FileFormat(StrEnum):
-    """A format of a single file; ``mesh-ply`` is there with every result."""
+    """A format of a single file; ``mesh-ply`` is there with every result, ``html`` and ``pdf`` are the report on it."""
 
     MESH_PLY = "mesh-ply"
     MESH_STL = "mesh-stl"
@@ -19,6 +19,8 @@ class FileFormat(StrEnum):
     ENVI = "envi"
     ZARR = "zarr"
     CSV = "csv"
+    HTML = "html"
+    PDF = "pdf"
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,8 @@ KINDS: dict[FileFormat, FileKind] = {
     FileFormat.ENVI: FileKind("envi.zip", "application/zip"),
     FileFormat.ZARR: FileKind("zarr.zip", "application/zip"),
     FileFormat.CSV: FileKind("csv", "text/csv"),
+    FileFormat.HTML: FileKind("report.html", "text/html"),
+    FileFormat.PDF: FileKind("report.pdf", "application/pdf"),
 }
 
 

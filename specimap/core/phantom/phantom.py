@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 
@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from specimap.core.geometry import View
 from specimap.core.phantom import materials
-from specimap.core.phantom.render import Paint, Rendering, render_view, srgb_from_linear
+from specimap.core.phantom.render import CLASS_SPECIMEN, Paint, Rendering, render_view, srgb_from_linear
 from specimap.core.phantom.scene import Scene, build_scene
 from specimap.core.phantom.settings import PhantomSettings, Stream
+from specimap.core.phantom.specimen import displacement
 from specimap.core.phantom.truth import Truth
 from specimap.core.phantom.views import hsi_view, photo_views
 
@@ -39,13 +40,17 @@ class Phantom:
         """The photos' cameras."""
         return photo_views(self.settings)
 
-    def photos(self) -> Iterator[tuple[str, NDArray[np.uint8]]]:
+    def photos(self) -> Generator[tuple[str, NDArray[np.uint8]]]:
         """Name and upright RGB image (H, W, 3) of each photo, in order."""
         paint = Paint.of(self.scene, materials.linear_rgb())
         with ThreadPoolExecutor(_THREADS) as pool:
             images = pool.map(lambda i: self._photo(i, paint), range(self.settings.photos))
-            for i, image in enumerate(images):
-                yield f"view_{i:03d}", image
+            try:
+                for i, image in enumerate(images):
+                    yield f"view_{i:03d}", image
+            finally:
+                # Whoever stops early does not wait for the photos that are left.
+                pool.shutdown(wait=False, cancel_futures=True)
 
     def _photo(self, index: int, paint: Paint) -> NDArray[np.uint8]:
         s = self.settings
@@ -60,9 +65,16 @@ class Phantom:
 
     @cached_property
     def _cube_rendering(self) -> Rendering:
+        moved = displacement(self.settings) if self.settings.moved else None
+        scene = self.scene if moved is None else build_scene(self.settings, moved)
         # One channel per material: the mixture of each pixel, times its shading.
-        paint = Paint.of(self.scene, np.eye(len(materials.MATERIALS)), _CUBE_SHADING)
-        return render_view(self.scene, hsi_view(self.settings), paint)
+        paint = Paint.of(scene, np.eye(len(materials.MATERIALS)), _CUBE_SHADING)
+        rendering = render_view(scene, hsi_view(self.settings), paint)
+        if moved is not None:
+            # Truth is the tissue that a pixel saw, at the place where the photos show it.
+            tissue = rendering.classes == CLASS_SPECIMEN
+            rendering.xyz[tissue] = moved.inverse().apply(rendering.xyz[tissue])
+        return rendering
 
     @cached_property
     def _defects(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -145,7 +145,7 @@ def _specimen_colour(
         + v * paint.vertex[corner[:, 2]]
     )
     c = paint.basis.shape[1]
-    detail = scene.detail(points)
+    detail = scene.detail_at(points)
     brightness = np.clip(1 + scene.texture_contrast * _DETAIL_SD * detail, 0.3, 1.7)
     colour = at[:, :c] * (brightness * _lit(at[:, c], paint))[:, None]
     if gloss:

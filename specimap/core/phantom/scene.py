@@ -10,10 +10,10 @@ from embreex import mesh_construction, rtcore_scene
 from numpy.typing import NDArray
 
 from specimap.core.errors import SettingsError, UnknownDictionaryError
-from specimap.core.geometry import Floats, rotation_from_vector
+from specimap.core.geometry import Floats, Pose, rotation_from_vector
 from specimap.core.phantom.noise import Floats32, NoiseVolume, band_noise
 from specimap.core.phantom.settings import PhantomSettings, Stream
-from specimap.core.phantom.specimen import TRAY_Z_MM, Specimen, build_specimen
+from specimap.core.phantom.specimen import TRAY_Z_MM, Specimen, build_specimen, displaced
 
 SPECIMEN, CARDS, TRAY, BENCH = range(4)
 BENCH_Z_MM = -8.0
@@ -99,6 +99,12 @@ class Scene:
     tray_half_mm: float
     tray_maps: Floats32
     """(texels, texels, 2): share of speckle, irradiance; rows grow with y."""
+    moved: Pose | None = None
+    """From the specimen's place in the photos to its place here; None where it is the same."""
+
+    def detail_at(self, points: Floats) -> Floats32:
+        """Fine brightness detail (S,) of the tissue at points (S, 3) on the specimen; it moves with the tissue."""
+        return self.detail(points if self.moved is None else self.moved.inverse().apply(points))
 
     def tray_at(self, points: Floats) -> tuple[Floats32, Floats32]:
         """Share of speckle (S,) and irradiance (S,) on the tray under points (S, 3), S < 32768."""
@@ -113,9 +119,14 @@ class Scene:
         return maps[:, 0], maps[:, 1]
 
 
-def build_scene(settings: PhantomSettings) -> Scene:
-    """Specimen, cards and tray of ``settings``, lit. Raises as :func:`place_cards` does."""
+def build_scene(settings: PhantomSettings, moved: Pose | None = None) -> Scene:
+    """Specimen, ``moved`` where that is given, cards and tray of ``settings``, lit where they then stand.
+
+    Raises as :func:`place_cards` does.
+    """
     specimen = build_specimen(settings)
+    if moved is not None:
+        specimen = displaced(specimen, moved)
     cards = place_cards(settings)
     half = settings.scene_mm + 28
     quads = [cards.outlines, _square(half, TRAY_Z_MM), _square(_BENCH_HALF_MM, BENCH_Z_MM)]
@@ -132,6 +143,7 @@ def build_scene(settings: PhantomSettings) -> Scene:
         vertex_irradiance=_irradiance(shade, specimen.vertices, specimen.normals, lights, weights),
         tray_half_mm=half,
         tray_maps=_tray_maps(settings, shade, half, lights, weights),
+        moved=moved,
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from specimap.core.errors import SettingsError
 
 _ADVICE = "Give a value within the stated range."
+_MOST_TILT_DEG = 20.0
 
 
 class Stream(IntEnum):
@@ -80,6 +81,14 @@ class PhantomSettings:
     bad_band_fraction: float = 0.0
     dead_pixel_fraction: float = 0.0
 
+    # ---- between photos and cube ----
+    moved_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Shift of the specimen alone, after the photos and before the cube; cards and tray stay."""
+    moved_deg: float = 0.0
+    """Turn of the specimen about the vertical through the middle of its base, before the shift."""
+    moved_tilt_deg: float = 0.0
+    """Tilt of the specimen about the x axis through the middle of its base, after the turn; the low side sinks in."""
+
     def __post_init__(self) -> None:
         least: dict[str, float] = {
             "seed": 0, "mesh_divisions": 4, "texture_contrast": 0, "gloss": 0, "edge_mm": 0.1,
@@ -106,8 +115,17 @@ class PhantomSettings:
             raise SettingsError(
                 "wavelength_nm must rise.", advice="Give (first, last) in nm.", setting="wavelength_nm"
             )
+        if not np.isfinite([*self.moved_mm, self.moved_deg]).all() or not abs(self.moved_tilt_deg) <= _MOST_TILT_DEG:
+            raise SettingsError(
+                "The specimen's motion is not finite, or tilts it too far.", advice=_ADVICE, setting="moved_mm"
+            )
         if min(self.specimen_mm) < 1:
             raise SettingsError("specimen_mm is below 1 mm.", advice=_ADVICE, setting="specimen_mm")
+
+    @property
+    def moved(self) -> bool:
+        """Whether the cube shows the specimen elsewhere than the photos do."""
+        return any((*self.moved_mm, self.moved_deg, self.moved_tilt_deg))
 
     @property
     def card_mm(self) -> float:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from specimap.core.geometry import Floats
+from specimap.core.geometry import Floats, Pose, rotation_from_vector
 from specimap.core.phantom import materials
 from specimap.core.phantom.noise import NoiseVolume, smoothstep
 from specimap.core.phantom.settings import PhantomSettings, Stream
@@ -51,6 +51,19 @@ def build_specimen(settings: PhantomSettings) -> Specimen:
     vertices = _rest_on_tray(vertices, settings)
     normals = vertex_normals(vertices, triangles)
     return Specimen(vertices, triangles, normals, _tissue(rng, base, axes, fat, crease))
+
+
+def displacement(settings: PhantomSettings) -> Pose:
+    """Where the cube finds the specimen: a rigid map from its place in the photos to its place in the cube, mm."""
+    tilt, turn = np.radians([settings.moved_tilt_deg, settings.moved_deg])
+    R = rotation_from_vector(np.array([tilt, 0.0, 0.0])) @ rotation_from_vector(np.array([0.0, 0.0, turn]))
+    base = np.array([0.0, 0.0, TRAY_Z_MM])
+    return Pose(R, base - R @ base + np.array(settings.moved_mm))
+
+
+def displaced(specimen: Specimen, by: Pose) -> Specimen:
+    """The same tissue at another place."""
+    return replace(specimen, vertices=by.apply(specimen.vertices), normals=specimen.normals @ by.R.T)
 
 
 def _rest_on_tray(vertices: Floats, settings: PhantomSettings) -> Floats:

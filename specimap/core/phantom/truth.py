@@ -36,7 +36,11 @@ class Truth:
     """Relative to the phantom's folder."""
     hsi_view: View
     hsi_xyz: NDArray[np.float32]
-    """(H, W, 3) mm: first hit of the ray through each cube pixel's centre; NaN if none."""
+    """(H, W, 3) mm: first hit of the ray through each cube pixel's centre; NaN if none.
+
+    Where the specimen moved between photos and cube, the ray meets the moved specimen, and what stands here is
+    where that tissue lay in the photos: the place that its spectrum belongs to. ``vertices`` are as in the photos.
+    """
     hsi_class: NDArray[np.uint8]
     """(H, W): 0 none, 1 specimen, 2 marker card, 3 tray, 4 bench."""
     abundance: NDArray[np.float32]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +19,7 @@ from specimap.core.phantom.settings import PhantomSettings
 from specimap.core.phantom.truth import Truth, save_truth
 
 _AXES = {"bsq": (2, 0, 1), "bil": (0, 2, 1), "bip": (0, 1, 2)}
+_PHOTOS_SHARE, _CUBE_SHARE = 0.75, 0.95
 _ENCODERS = {"jpg": cv2.IMWRITE_JPEG_QUALITY, "png": None}
 
 
@@ -27,10 +30,12 @@ def write_phantom(
     interleave: str = "bsq",
     photo_format: str = "jpg",
     quality: int = 95,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> Truth:
     """Write the phantom of ``settings`` into ``folder`` and return its truth.
 
-    ``interleave``: bsq, bil or bip. ``photo_format``: jpg (of ``quality``) or png. Raises ``SettingsError``.
+    ``interleave``: bsq, bil or bip. ``photo_format``: jpg (of ``quality``) or png. Raises ``SettingsError``; what
+    ``progress`` raises ends the writing.
     """
     if interleave not in _AXES:
         raise SettingsError(
@@ -43,15 +48,19 @@ def write_phantom(
     phantom = Phantom(settings)
     flag = _ENCODERS[photo_format]
     names = []
-    for name, image in phantom.photos():
-        names.append(f"rgb/{name}.{photo_format}")
-        options = [flag, quality] if flag is not None else []
-        _, encoded = cv2.imencode(f".{photo_format}", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
-        with atomic_path(folder / names[-1]) as aside:
-            aside.write_bytes(encoded.tobytes())
+    with closing(phantom.photos()) as photos:
+        for name, image in photos:
+            names.append(f"rgb/{name}.{photo_format}")
+            options = [flag, quality] if flag is not None else []
+            _, encoded = cv2.imencode(f".{photo_format}", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
+            with atomic_path(folder / names[-1]) as aside:
+                aside.write_bytes(encoded.tobytes())
+            progress(_PHOTOS_SHARE * len(names) / settings.photos)
     write_cube(phantom.cube(), settings.wavelengths_nm, folder / "hsi" / "hsi.hdr", interleave=interleave)
+    progress(_CUBE_SHARE)
     truth = replace(phantom.truth, photo_names=names)
     save_truth(truth, folder / "truth.npz")
+    progress(1.0)
     return truth
 
 

@@ -35,7 +35,10 @@ FORMAT = 2
 
 @dataclass(frozen=True)
 class Stage1:
-    """Reconstruction with the corners it was made from, the photos' names, and the posed photos in grey (H, W)."""
+    """Reconstruction with the corners it was made from, the photos' names, and the posed photos in grey (H, W).
+
+    ``sheet``: small tiles of the posed photos, a JPEG; empty in artefacts of versions that made none.
+    """
 
     reconstruction: Reconstruction
     corners: CornersInPhotos
@@ -43,6 +46,7 @@ class Stage1:
     refused: tuple[Refusal, ...]
     subject_mm: float | None
     greys: tuple[NDArray[np.uint8], ...]
+    sheet: bytes = b""
 
     def without_depth(self) -> Stage1:
         """The same without depth maps and images, for what comes after the mesh."""
@@ -117,6 +121,7 @@ def save_stage1(store: Store, key: str, stage: Stage1) -> None:
         "seen_corners": c.seen.corners_px,
         "seen_sigma": c.seen.sigma_px,
         "greys": np.stack(stage.greys),
+        "sheet": np.frombuffer(stage.sheet, np.uint8),
     }
     maps_meta = []
     for k, m in enumerate(r.maps):
@@ -161,7 +166,7 @@ def load_stage1(store: Store, key: str, *, with_depth: bool = True) -> Stage1 | 
     return Stage1(
         reconstruction, CornersInPhotos(seen, tuple(meta["marker_ids"])), tuple(meta["names"]),
         tuple(Refusal(**x) for x in meta["refused"]), meta["subject_mm"],
-        tuple(arrays.get("greys", ())),
+        tuple(arrays.get("greys", ())), bytes(arrays.get("sheet", b"")),
     )  # fmt: skip
 
 

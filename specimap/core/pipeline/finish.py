@@ -23,6 +23,7 @@ from specimap.core.layout import edge_lengths
 from specimap.core.meshfile import write_mesh_ply
 from specimap.core.pipeline.artefacts import Stage1, Stage2
 from specimap.core.pipeline.clock import Clock
+from specimap.core.pipeline.corners import cube_corners, photo_corners
 from specimap.core.pipeline.outputs import Outputs, staged
 from specimap.core.pipeline.settings import PipelineSettings
 from specimap.core.pipeline.stages import all_refused
@@ -85,12 +86,14 @@ def register_and_write(
                 aside.cloud,
                 points,
                 cube,
-                {"report": report.model_dump(mode="json"), "settings": settings.as_dict(), "inputs": inputs},
+                {"report": report.summary(), "settings": settings.as_dict(), "inputs": inputs},
                 progress=lambda share: progress(0.4 + 0.5 * share),
             )
             write_preview(Cloud.open(aside.cloud), aside.preview)
+            if stage1.sheet:
+                aside.sheet.write_bytes(stage1.sheet)
             report = report.model_copy(update={"seconds": clock.so_far()})
-            write_text(aside.report, report.model_dump_json(indent=1))
+            write_text(aside.report, report.text())
     return report
 
 
@@ -135,6 +138,7 @@ def _register(
         adjusted.corners,
         float(np.median(adjusted.sigma_corner_mm)),
         camera.sideways_mm,
+        camera.pixel_mm,
         None if by_camera else apart,
     )
     progress(0.35)
@@ -183,6 +187,8 @@ def _register(
         warnings=[Remark(code=c, message=m) for c, m in [*remarks, *_remarks(stage1, adjusted, found)]],
         settings=settings.as_dict(),
         inputs=inputs,
+        photo_corners=photo_corners(stage1, adjusted),
+        cube_corners=cube_corners(found, adjusted, camera.view, cube.rows, cube.cols),
     )
     return points, report
 

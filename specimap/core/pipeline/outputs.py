@@ -58,6 +58,11 @@ class Outputs:
         return self.folder / "preview.png"
 
     @property
+    def sheet(self) -> Path:
+        """Small tiles of the used photos; not there where stage 1 was kept from a version that made none."""
+        return self.folder / "photos.jpg"
+
+    @property
     def store(self) -> Store:
         """The stages' artefacts."""
         return Store(self.folder / "stages")
@@ -100,6 +105,9 @@ def staged(outputs: Outputs) -> Iterator[Outputs]:
             aside.folder.mkdir()
             yield aside
             outputs.report.unlink(missing_ok=True)
+            outputs.sheet.unlink(missing_ok=True)
+            if aside.sheet.exists():
+                replace(aside.sheet, outputs.sheet)
             for name in ("cloud", "mesh", "corners", "preview", "report"):
                 replace(getattr(aside, name), getattr(outputs, name))
         finally:

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from specimap.core.acquisition import Photo, Refusal, read_photos
+from specimap.core.acquisition import Photo, Refusal, read_photos, stated_focal_px
 from specimap.core.adjust import adjust
 from specimap.core.native import preload
+from specimap.core.photosheet import contact_sheet
 from specimap.core.pipeline.artefacts import (
     Stage1,
     Stage2,
@@ -22,16 +23,18 @@ from specimap.core.pipeline.artefacts import (
 )
 from specimap.core.pipeline.clock import Clock
 from specimap.core.pipeline.settings import PipelineSettings
+from specimap.core.points import worth_refining
 from specimap.core.raycast import RayCaster
 from specimap.core.reconstruct.backend import ReconstructionBackend, corners_in_photos, detect_in_photos
+from specimap.core.reconstruct.breathing import settle_breathing
 from specimap.core.reconstruct.depth import volume_over
 from specimap.core.refine import pixel_footprint_mm, refine_mesh
 from specimap.core.render import Grid, extent_of, render_grid
 from specimap.core.surface import fuse
-from specimap.core.uncertainty import vertex_sigma
+from specimap.core.uncertainty import mesh_sigma
 
-VOXEL_PIXELS = 2.0
-"""Edge of a fusion voxel in photo pixels on the specimen: finer ones hold noise, coarser ones lose bumps."""
+VOXEL_PIXELS = 1.4
+"""Edge of a fusion voxel in matched pixels on the specimen: finer ones hold noise, coarser ones lose bumps."""
 GRID_MARGIN_MM = 4.0
 
 
@@ -74,6 +77,9 @@ def reconstruct_stage(
             photos, settings.reconstruct.dictionary, workers=workers, progress=lambda s: progress(0.08 + 0.12 * s)
         )
         corners = corners_in_photos(photos, detections, settings.reconstruct.dictionary)
+        photos, corners, zooms = settle_breathing(
+            photos, corners, edge_mm=settings.adjust.edge_mm, focal_px=stated_focal_px(photos)
+        )
         reconstruction = backend_named(settings.reconstruct.backend).reconstruct(
             photos,
             corners,
@@ -81,9 +87,15 @@ def reconstruct_stage(
             workers=workers,
             progress=lambda s: progress(0.2 + 0.8 * s),
         )
+        if (zooms != 1).any():
+            remark = "focal_breathing", f"The photos' focal lengths differ by {100 * zooms.std():.1f} % " + (
+                "(standard deviation); each photo was brought to the one they share."
+            )
+            reconstruction = replace(reconstruction, remarks=(*reconstruction.remarks, remark))
         stage = Stage1(
             reconstruction, corners, tuple(p.name for p in photos), tuple(refused), _subject_mm(photos),
             tuple(photos[p].grey for p in reconstruction.photos),
+            contact_sheet([photos[p].image for p in reconstruction.photos]),
         )  # fmt: skip
         save_stage1(store, key, stage)
         return stage
@@ -116,17 +128,19 @@ def adjust_stage(
         adjusted = adjust(r.lens, r.poses, posed, stage1.corners.marker_ids, settings.adjust)
         maps = tuple(replace(m, depth=m.depth * np.float32(adjusted.scale)) for m in r.maps)
         target = volume_over(adjusted.corners).centre
-        voxel_mm = settings.surface.voxel_mm or VOXEL_PIXELS * pixel_footprint_mm(
-            adjusted.lens, adjusted.poses, target
-        )
+        pixel_mm = pixel_footprint_mm(adjusted.lens, adjusted.poses, target)
+        shrinkage = settings.reconstruct.depth.shrinkage(adjusted.lens)
+        voxel_mm = settings.surface.voxel_mm or VOXEL_PIXELS * pixel_mm / shrinkage
         fused = fuse(
             list(maps), adjusted.poses, voxel_mm, settings.surface, progress=lambda s: progress(0.05 + 0.4 * s)
         )
-        mesh = refine_mesh(
+        refined = refine_mesh(
             fused, list(stage1.greys), adjusted.lens, adjusted.poses, voxel_mm, settings.refine,
-            workers=workers, progress=lambda s: progress(0.45 + 0.5 * s),
+            workers=workers, worth=worth_refining(fused.vertices, adjusted.corners),
+            progress=lambda s: progress(0.45 + 0.5 * s),
         )  # fmt: skip
-        stage = Stage2(adjusted, mesh, vertex_sigma(mesh, maps, adjusted.poses, workers=workers).astype(float))
+        sigma = mesh_sigma(refined, maps, adjusted.poses, workers=workers)
+        stage = Stage2(adjusted, refined.mesh, sigma.astype(float))
         save_stage2(store, key, stage)
         return stage
 

@@ -1,4 +1,5 @@
-"""The ``colmap`` backend: poses from markers, features where markers do not reach, dense depth on the CPU."""
+"""The ``colmap`` backend: poses from markers, features where markers do not reach, dense depth on
+the CPU, or by COLMAP on a GPU."""
 
 from __future__ import annotations
 
@@ -10,8 +11,8 @@ from specimap.core.reconstruct.backend import (
     ReconstructSettings,
     sparse_points,
 )
-from specimap.core.reconstruct.dense import dense_depth
 from specimap.core.reconstruct.depth import volume_over
+from specimap.core.reconstruct.patchmatch import measure_depth
 from specimap.core.reconstruct.posing import pose_photos
 
 
@@ -30,9 +31,11 @@ class ColmapBackend:
         progress: Progress,
     ) -> Reconstruction:
         """See :class:`specimap.core.reconstruct.backend.ReconstructionBackend`."""
-        posed = pose_photos(photos, corners, settings)
+        posed = pose_photos(
+            photos, corners, settings, workers=workers, progress=lambda share: progress(0.15 * share)
+        )
         progress(0.15)
-        maps = dense_depth(
+        maps, remarks = measure_depth(
             [photos[p].image for p in posed.photos],
             posed.lens,
             posed.poses,
@@ -43,5 +46,5 @@ class ColmapBackend:
         )
         return Reconstruction(
             posed.photos, posed.lens, posed.poses, tuple(maps), sparse_points(maps, posed.poses),
-            posed.refused, posed.remarks,
+            posed.refused, (*posed.remarks, *remarks),
         )  # fmt: skip

@@ -17,6 +17,8 @@ COARSE_PX = 256
 COARSE_PAIRS = 10
 COARSE_CELLS = 40
 """Cells of the coarse grid along the volume's diagonal."""
+ALIAS_SIGMA = 0.5
+"""Standard deviation of an image's own blur in its pixels; shrinking adds in squares what it lacks."""
 
 
 def find_content(
@@ -84,11 +86,17 @@ def dense_depth(
     """Depth maps of all pairs; ``images``: posed photos (H, W, 3), in the order of ``poses``."""
     pairs = choose_pairs(poses, volume.centre, settings)
     content = find_content(images, lens, poses, volume, pairs, settings, workers)
+    shrinkage = settings.shrinkage(lens)
+    # What the smaller virtual images cannot hold would alias.
+    blur = ALIAS_SIGMA * float(np.sqrt(1 / shrinkage**2 - 1))
+    images = [np.asarray(cv2.GaussianBlur(image, (0, 0), blur)) for image in images] if blur else images
     maps: list[DepthMap] = []
 
     def run(pair: tuple[int, int]) -> DepthMap | None:
         i, j = pair
-        return match_pair((images[i], images[j]), lens, (poses[i], poses[j]), volume, content, i, settings)
+        return match_pair(
+            (images[i], images[j]), lens, (poses[i], poses[j]), volume, content, i, settings, shrinkage
+        )
 
     with ThreadPoolExecutor(workers) as pool:
         for done, depth_map in enumerate(pool.map(run, pairs), 1):

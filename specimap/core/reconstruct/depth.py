@@ -7,6 +7,7 @@ rolled. Matching is OpenCV's StereoSGBM (Hirschmueller 2008), over the dispariti
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ MOST_DISPARITIES = 512
 
 Bytes = NDArray[np.uint8]
 Singles = NDArray[np.float32]
+Device = Literal["auto", "cpu", "gpu"]
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,10 @@ class DepthSettings:
     ``angle_deg``: least, best and widest angle between two photos' directions to the scene. ``wide_angle_deg``:
     the widest angle where a photo has no nearer neighbour. ``pairs_per_photo``: partners of each photo; one
     fewer from ``many_photos`` on, since every place is then seen by more photos anyway. ``block_px``: matching
-    window. ``uniqueness``: per cent by which the best match must win.
+    window. ``matching_share`` and ``most_matching_px``: photos are matched at this share of their size, and no larger;
+    the mesh is refined on the photos as they are, after which it is as good as from full-size matching.
+    ``uniqueness``: per cent by which the best match must win. ``device``: where depth is measured; ``auto``
+    is a GPU where one is in sight.
     """
 
     angle_deg: tuple[float, float, float] = (4.0, 14.0, 30.0)
@@ -35,7 +40,15 @@ class DepthSettings:
     pairs_per_photo: int = 3
     many_photos: int = 32
     block_px: int = 3
+    matching_share: float = 0.6
+    most_matching_px: int = 640
     uniqueness: int = 8
+    device: Device = "auto"
+
+
+    def shrinkage(self, lens: Intrinsics) -> float:
+        """Factor by which photos of ``lens`` are shrunk before they are matched."""
+        return min(self.matching_share, self.most_matching_px / max(lens.width, lens.height))
 
 
 @dataclass(frozen=True)
@@ -144,8 +157,9 @@ class _Rectified:
     range_px: tuple[int, int]
 
 
-def _rectify(lens: Intrinsics, first: Pose, second: Pose, content: Floats) -> _Rectified | None:
-    """Virtual cameras for a pair, cut to where ``content`` (N, 3) shows; None where it cannot be rectified."""
+def _rectify(lens: Intrinsics, first: Pose, second: Pose, content: Floats, shrinkage: float) -> _Rectified | None:
+    """Virtual cameras for a pair, cut to where ``content`` (N, 3) shows, ``shrinkage`` as large as the photos; None
+    where it cannot be rectified."""
     baseline = second.centre - first.centre
     length = float(np.linalg.norm(baseline))
     forward = first.R[2] + second.R[2]
@@ -158,14 +172,15 @@ def _rectify(lens: Intrinsics, first: Pose, second: Pose, content: Floats) -> _R
     cam = (content - first.centre) @ R.T
     if cam[:, 2].min() <= 0.05 * cam[:, 2].max():
         return None
-    pixels = lens.focal_px * cam[:, :2] / cam[:, 2:]
-    most = 1.3 * np.array([lens.width, lens.height])
+    focal_px = shrinkage * lens.focal_px
+    pixels = focal_px * cam[:, :2] / cam[:, 2:]
+    most = 1.3 * shrinkage * np.array([lens.width, lens.height])
     low, high = np.maximum(pixels.min(0), -most), np.minimum(pixels.max(0), most)
     width, height = (int(v) for v in np.ceil(high - low) + 1)
     if width < 32 or height < 32:
         return None
-    virtual = Intrinsics(width, height, lens.focal_px, float(-low[0]), float(-low[1]))
-    disparity = lens.focal_px * length / cam[:, 2]
+    virtual = Intrinsics(width, height, focal_px, float(-low[0]), float(-low[1]))
+    disparity = focal_px * length / cam[:, 2]
     least = int(np.floor(disparity.min())) - 1
     count = -(-(int(np.ceil(disparity.max())) + 1 - least) // 16) * 16
     if count > MOST_DISPARITIES:
@@ -191,12 +206,13 @@ def match_pair(
     content: Floats,
     photo: int,
     settings: DepthSettings,
+    shrinkage: float = 1.0,
 ) -> DepthMap | None:
     """Depth of the first of two photos (H, W, 3) from both, searched over where ``content`` (N, 3) lies.
 
-    None where the pair gives nothing.
+    ``shrinkage``: share of the photos' resolution that is matched. None where the pair gives nothing.
     """
-    rectified = _rectify(lens, *poses, content)
+    rectified = _rectify(lens, *poses, content, shrinkage)
     if rectified is None:
         return None
     virtual, (least, count) = rectified.lens, rectified.range_px
@@ -218,14 +234,19 @@ def match_pair(
     total = found + least
     usable = (found >= 0) & (total > 0.5)
     depth = np.where(usable, virtual.focal_px * rectified.baseline_mm / np.where(usable, total, 1), 0)
-    depth = _inside(depth.astype(np.float32), virtual, rectified.turns[0] @ poses[0].R, poses[0], volume)
-    return _cropped(photo, rectified.turns[0], virtual, depth, left)
+    depth = inside_volume(depth.astype(np.float32), virtual, rectified.turns[0] @ poses[0].R, poses[0], volume)
+    return cropped_map(photo, rectified.turns[0], virtual, depth, left)
 
 
-def _cropped(
-    photo: int, turn: Floats, virtual: Intrinsics, depth: Singles, colour: Bytes
+def cropped_map(
+    photo: int,
+    turn: Floats,
+    virtual: Intrinsics,
+    depth: Singles,
+    colour: Bytes,
+    confidence: Bytes | None = None,
 ) -> DepthMap | None:
-    """The part of the window that holds depth; None where too little does."""
+    """The part of the window that holds depth, sure of all of it by default; None where too little does."""
     rows, cols = np.flatnonzero(depth.any(1)), np.flatnonzero(depth.any(0))
     if len(rows) < 8 or len(cols) < 8:
         return None
@@ -238,11 +259,12 @@ def _cropped(
         cx=virtual.cx - float(left),
         cy=virtual.cy - float(top),
     )
-    confidence = np.where(part > 0, 255, 0).astype(np.uint8)
-    return DepthMap(photo, turn, lens, part, confidence, np.ascontiguousarray(colour[top:bottom, left:right]))
+    sure = np.full(depth.shape, 255, np.uint8) if confidence is None else confidence
+    sure = np.where(part > 0, sure[top:bottom, left:right], 0).astype(np.uint8)
+    return DepthMap(photo, turn, lens, part, sure, np.ascontiguousarray(colour[top:bottom, left:right]))
 
 
-def _inside(depth: Singles, virtual: Intrinsics, R: Floats, pose: Pose, volume: Volume) -> Singles:
+def inside_volume(depth: Singles, virtual: Intrinsics, R: Floats, pose: Pose, volume: Volume) -> Singles:
     """Depths whose points lie outside the volume become 0."""
     v, u = np.indices(depth.shape, dtype=np.float32)
     rays = np.stack([(u - virtual.cx) / virtual.focal_px, (v - virtual.cy) / virtual.focal_px,

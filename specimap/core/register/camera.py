@@ -38,7 +38,12 @@ class CubeCamera:
     @property
     def sideways_mm(self) -> float:
         """Sideways standard deviation of a registered pixel: the corners' misfit, shared by all of them."""
-        return self.rms_px * float(self.view.cam_from_world.centre[2]) / self.view.intrinsics.focal_px
+        return self.rms_px * self.pixel_mm
+
+    @property
+    def pixel_mm(self) -> float:
+        """What a pixel spans at the marker plane."""
+        return float(self.view.cam_from_world.centre[2]) / self.view.intrinsics.focal_px
 
 
 def solve_camera(

@@ -1,0 +1,156 @@
+"""SIFT and ALIKED where they matter: phantoms of little texture and much gloss whose markers few photos show."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from specimap.core.acquisition import AcquisitionSettings, Photo, photo_paths, read_photos
+from specimap.core.errors import SpecimapError
+from specimap.core.geometry import Floats, Pose, fit_similarity
+from specimap.core.phantom import PhantomSettings, write_phantom
+from specimap.core.phantom.truth import Truth
+from specimap.core.raycast import RayCaster
+from specimap.core.reconstruct.backend import (
+    CornersInPhotos,
+    ReconstructSettings,
+    corners_in_photos,
+    detect_in_photos,
+)
+from specimap.core.reconstruct.dense import dense_depth
+from specimap.core.reconstruct.depth import DepthSettings, volume_over
+from specimap.core.reconstruct.features import aliked_missing
+from specimap.core.reconstruct.posing import Posed, pose_photos
+from specimap.core.surface import Mesh, SurfaceSettings, fuse, vertex_normals
+
+PHOTOS = 16
+WITH_MARKERS = 4
+WORKERS = 2
+CASES = ((1.0, 0.15), (0.5, 0.15), (0.25, 0.15), (0.1, 0.15), (0.25, 0.4), (0.25, 0.8))
+"""Texture contrast and gloss."""
+VOXEL_MM = 0.3
+SPECIMEN_MIDDLE = np.array([0.0, 0.0, 6.0])
+KINDS: tuple[Literal["sift", "aliked"], ...] = ("sift", "aliked")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """``photos`` posed; median and largest error of the poses of those without markers, in degrees and in mm by which
+    the middle of the specimen shifts across the line of sight; median error of the surface's height, mm; seconds."""
+
+    photos: int
+    deg: float
+    mm: float
+    worst_mm: float
+    surface_mm: float
+    seconds: float
+
+
+def bench_features(console: Console, work: Path, repeats: int) -> dict[str, object]:
+    """Each case by each kind of features; the fastest of ``repeats`` gives the seconds."""
+    table = Table(
+        title=f"{PHOTOS} photos, markers read in {WITH_MARKERS} neighbours only; the rest by features",
+        title_justify="left",
+    )
+    for heading in (
+        "texture", "gloss", "features", "photos posed", "pose deg", "pose mm", "worst mm", "surface mm", "seconds",
+    ):  # fmt: skip
+        table.add_column(heading, justify="left" if heading == "features" else "right")
+    kinds = KINDS[:1] if aliked_missing() else KINDS
+    figures: dict[str, object] = {}
+    for texture, gloss in CASES:
+        folder = work / f"features_{texture}_{gloss}"
+        truth = write_phantom(
+            PhantomSettings(
+                photos=PHOTOS, texture_contrast=texture, gloss=gloss, bands=2, cube_rows=64, cube_cols=64
+            ),
+            folder,
+        )
+        photos, _ = read_photos(photo_paths(folder / "rgb"), AcquisitionSettings())
+        corners = _in_neighbours(photos, truth)
+        for kind in kinds:
+            runs = [_run(photos, corners, truth, kind) for _ in range(repeats)]
+            found = [r for r in runs if isinstance(r, Outcome)]
+            row = [f"{texture:g}", f"{gloss:g}", kind]
+            if not found:
+                table.add_row(*row, str(runs[0]), *"-----")
+                figures[" ".join(row)] = str(runs[0])
+                continue
+            best = min(found, key=lambda r: r.seconds)
+            table.add_row(
+                *row, f"{best.photos} of {PHOTOS}", f"{best.deg:.2f}", f"{best.mm:.3f}", f"{best.worst_mm:.2f}",
+                f"{best.surface_mm:.3f}", f"{best.seconds:.1f}",
+            )  # fmt: skip
+            figures[" ".join(row)] = vars(best)
+    console.print(table)
+    if len(kinds) < len(KINDS):
+        console.print("ALIKED is not installed: SIFT alone was measured.")
+    return figures
+
+
+def _in_neighbours(photos: list[Photo], truth: Truth) -> CornersInPhotos:
+    """The corners of the photos next to the first; elsewhere the markers count as not seen."""
+    detections = detect_in_photos(photos, "DICT_4X4_50", workers=WORKERS, progress=lambda share: None)
+    corners = corners_in_photos(photos, detections, "DICT_4X4_50")
+    centres = np.stack([v.cam_from_world.centre for v in truth.views])
+    near = np.argsort(np.linalg.norm(centres - centres[0], axis=1))[:WITH_MARKERS]
+    return CornersInPhotos(corners.seen.of(np.isin(corners.seen.photo, near)), corners.marker_ids)
+
+
+def _run(
+    photos: list[Photo], corners: CornersInPhotos, truth: Truth, kind: Literal["sift", "aliked"]
+) -> Outcome | str:
+    start = time.perf_counter()
+    try:
+        posed = pose_photos(photos, corners, ReconstructSettings(features=kind), workers=WORKERS)
+    except SpecimapError as error:
+        return error.code
+    seconds = time.perf_counter() - start
+    _, R, t = fit_similarity(posed.corners.reshape(-1, 3), truth.marker_corners.reshape(-1, 3))
+    to_truth = Pose(R, t)
+    back = to_truth.inverse()
+    deg, mm = [], []
+    for photo, pose in zip(posed.photos, posed.poses, strict=True):
+        if photo in corners.seen.photo:
+            continue
+        found, true = pose @ back, truth.views[photo].cam_from_world
+        deg.append(np.degrees(np.arccos(np.clip((np.trace(found.R.T @ true.R) - 1) / 2, -1, 1))))
+        mm.append(np.linalg.norm((found.apply(SPECIMEN_MIDDLE) - true.apply(SPECIMEN_MIDDLE))[:2]))
+    if not mm:
+        return "none located"
+    surface = _surface_mm(photos, posed, to_truth, truth)
+    return Outcome(
+        len(posed.photos), float(np.median(deg)), float(np.median(mm)), float(np.max(mm)), surface, seconds
+    )
+
+
+def _surface_mm(photos: list[Photo], posed: Posed, to_truth: Pose, truth: Truth) -> float:
+    """Median difference of the surfaces' heights over the specimen; not a number where nothing was fused."""
+    volume = volume_over(posed.corners)
+    images = [photos[p].image for p in posed.photos]
+    maps = dense_depth(images, posed.lens, posed.poses, volume, DepthSettings(), workers=WORKERS)
+    try:
+        mesh = fuse(maps, posed.poses, VOXEL_MM, SurfaceSettings())
+    except SpecimapError:
+        return float("nan")
+    low, high = truth.vertices[:, :2].min(0), truth.vertices[:, :2].max(0)
+    x, y = np.meshgrid(np.arange(low[0], high[0], 0.5), np.arange(low[1], high[1], 0.5))
+    found = _heights(_mesh(to_truth.apply(mesh.vertices.astype(float)), mesh.triangles), x.ravel(), y.ravel())
+    true = _heights(_mesh(truth.vertices, truth.triangles), x.ravel(), y.ravel())
+    return float(np.nanmedian(np.abs(found - true)))
+
+
+def _mesh(vertices: Floats, triangles: np.ndarray[tuple[int, ...], np.dtype[np.int32]]) -> Mesh:
+    single = vertices.astype(np.float32)
+    return Mesh(single, triangles, vertex_normals(single, triangles), np.zeros(single.shape, np.uint8))
+
+
+def _heights(mesh: Mesh, x: Floats, y: Floats) -> Floats:
+    above = np.stack([x, y, np.full(len(x), 100.0)], -1)
+    return RayCaster(mesh).cast(above, np.tile([0.0, 0.0, -1.0], (len(x), 1))).xyz[:, 2].astype(float)

@@ -1,0 +1,205 @@
+"""What the figures mean in words: the verdict, the checks, and what to do about each warning and refused photo."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from specimap.core.acquisition import RECOMMENDED_PHOTOS
+from specimap.core.document.blocks import Level
+from specimap.core.document.photo_figures import LIMIT_MM
+from specimap.core.report import Report
+
+MOST_REFUSED = 2
+LEAST_COVERAGE = 0.97
+LAYOUT_MARKERS = 8
+"""Up to so many markers, all should show in the cube; of a whole board, four suffice."""
+
+REMARKS = {
+    "few_photos": f"Take {RECOMMENDED_PHOTOS} or more photos from all around; the errors then become smaller.",
+    "scale_implausible": "Measure the black edge of a printed marker with a calliper and give that number as the edge.",
+    "scale_contradicts_exif": "Measure the black edge of a printed marker and compare it with the edge that was given.",
+    "markers_missing_in_cube": "Record the cube again with all markers in view, lit, in focus and uncovered.",
+    "markers_not_in_band_mean": "Nothing, where the corners in the cube fit; else light the markers better.",
+    "cube_mirrored": "Nothing for this result. Have the camera's software export cubes that are not mirrored.",
+    "single_band": "Check the export: a cube of one band carries no spectra.",
+    "bands_all_zero": "Leave these bands out of any analysis.",
+    "pixels_nan": "Leave these pixels out of any analysis; record the cube again if they lie on the specimen.",
+    "values_nan": "Leave these values out of any analysis.",
+    "saturated": "Expose the cube shorter: saturated pixels are flagged and carry no true spectrum.",
+    "wavelengths_missing": "Export the cube with its wavelengths; bands are known by number only.",
+    "wavelengths_count_mismatch": "Export the cube again: its header names more or fewer wavelengths than bands.",
+    "wavelengths_invalid": "Export the cube again with wavelengths in nm that rise from band to band.",
+    "bad_bands_count_mismatch": "Export the cube again: its list of bad bands does not fit its bands.",
+    "bad_bands_all": "Check the header: it calls every band bad.",
+    "dark_missing": "Give a dark frame too; without it reflectance is a little too high where little light comes back.",
+    "reference_invalid": "Give the white and dark frames that belong to this cube.",
+    "byte_order_assumed": "Look whether the spectra are plausible; export the cube with its byte order.",
+    "axes_assumed": "Look whether the picture is that of the specimen; export the cube with named axes.",
+    "data_longer_than_header": "Check the export: the file holds more than its header says.",
+    "licence_non_commercial": "Use this result for no commercial purpose; run the default backend for any other.",
+}
+UNKNOWN_REMARK = "Read it before using the result; the documentation of errors and warnings says more."
+
+REFUSALS = {
+    "photo_unreadable": "Copy the photo again, or take it again.",
+    "photo_duplicate": "Nothing: the same photo is used once.",
+    "photo_blurred": "Take it again from the same side: tap to focus, hold still.",
+    "photo_foreign": "Leave it out if it shows something else; else show the markers in it.",
+    "photo_unlocated": "Take it again with two or more markers in view, between its neighbours.",
+}
+UNKNOWN_REFUSAL = "Take it again from the same side with the markers in view."
+
+MEANINGS = (
+    (
+        "2D corner error",
+        "Where the registration puts the cube's corners, against the adjusted corners, in the plane.",
+        "How it would be elsewhere: the fit was made on the same corners, and they all lie near one plane.",
+    ),
+    (
+        "3D corner error",
+        "The same against the surface under each corner.",
+        "Whether that surface is true: it is this run's own reconstruction, of paper, not of tissue.",
+    ),
+    (
+        "Leaving a marker out",
+        "The registration fitted without a marker, measured on it.",
+        "How it is above the markers' plane.",
+    ),
+    (
+        "Marker edge",
+        "Edges of corners triangulated one by one, against the known edge.",
+        "Whether the known edge is true: a wrong one makes everything larger or smaller.",
+    ),
+    (
+        "Between the two methods",
+        "How far apart the two methods put the specimen's pixels.",
+        "Which of them is right.",
+    ),
+    (
+        "Stated sigma",
+        "What this run states as the standard deviation of the position of the specimen's points.",
+        "Whether it is so: it is an estimate, which only truth can confirm.",
+    ),
+)
+"""Each figure, what it says, and what it cannot say; docs/accuracy.md."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that must be right: what was found, what is wanted, and what to do where it is not."""
+
+    name: str
+    found: str
+    wanted: str
+    good: bool
+    action: str
+
+
+def checks(report: Report) -> list[Check]:
+    """The four lines that docs/surgeon-imaging.md tells to look at."""
+    photos, left = report.photos, report.leave_one_marker_out_mm
+    refused = photos.given - len(photos.used)
+    in_photos, in_cube = report.marker_ids, report.marker_ids_in_cube
+    missing = sorted(set(in_photos) - set(in_cube))
+    of_a_board = len(in_photos) > LAYOUT_MARKERS
+    covered = report.coverage.between_markers
+    return [
+        Check(
+            "Photos used",
+            f"{len(photos.used)} of {photos.given}",
+            f"all but {MOST_REFUSED}",
+            refused <= MOST_REFUSED,
+            "Take the photos that were not used again: " + _listed([r.name for r in photos.refused]) + ".",
+        ),
+        Check(
+            "Markers in the cube",
+            f"{len(in_cube)} of {len(in_photos)}",
+            "4 or more" if of_a_board else "all that the photos show",
+            len(in_cube) >= 4 if of_a_board else not missing,
+            "Record the cube again with four or more markers in view, lit and uncovered." if of_a_board
+            else f"Record the cube again with marker {_listed([str(i) for i in missing])} in view, lit and uncovered.",
+        ),
+        Check(
+            "Leaving a marker out",
+            "too few markers to tell" if left is None else f"{left.median:.3f} mm, largest {left.maximum:.3f} mm",
+            f"median below {LIMIT_MM:g} mm",
+            left is not None and left.median < LIMIT_MM,
+            "Show three or more markers in the cube." if left is None
+            else "Something moved between photos and cube, or the marker's edge is wrong: check both and repeat.",
+        ),
+        Check(
+            "Coverage between the markers",
+            f"{100 * covered:.1f} %",
+            f"above {100 * LEAST_COVERAGE:.0f} %",
+            covered > LEAST_COVERAGE,
+            "Take more photos from the side that is missing in the coverage map.",
+        ),
+    ]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The first thing that is read."""
+
+    level: Level
+    title: str
+    sentences: tuple[str, ...]
+    actions: tuple[str, ...]
+
+
+def verdict(report: Report) -> Verdict:
+    """Whether the result holds what can be expected of it, and what to do where it does not."""
+    failed = [check for check in checks(report) if not check.good]
+    warned = len(report.warnings)
+    said = [placed(report), used(report)]
+    if not failed:
+        title = "The result holds what can be expected" + (", with the warnings below." if warned else ".")
+        level: Level = "note" if warned else "good"
+    else:
+        title = f"Look before use: {len(failed)} of {len(checks(report))} checks failed."
+        level = "attention"
+    actions = [check.action for check in failed]
+    return Verdict(level, title, tuple(said), tuple(actions))
+
+
+def placed(report: Report) -> str:
+    """How sure the places are."""
+    middle, most = report.sigma_mm.median, report.sigma_mm.p95
+    if not (math.isfinite(middle) and math.isfinite(most)):
+        return "How exactly the spectra are placed is not known: the run states no standard deviation."
+    return (
+        f"The spectra of the specimen are placed to about {_rounded(middle)} mm: the stated standard deviation of a "
+        f"point's position is {middle:.3f} mm (median) and below {most:.3f} mm for 95 % of the points."
+    )
+
+
+def used(report: Report) -> str:
+    """How many photos were used, and why not all."""
+    given, count = report.photos.given, len(report.photos.used)
+    if not given - count:
+        return f"All {given} photos were used."
+    reasons: dict[str, int] = {}
+    for refused in report.photos.refused:
+        reasons[refused.code] = reasons.get(refused.code, 0) + 1
+    why = ", ".join(f"{n} {code.removeprefix('photo_').replace('_', ' ')}" for code, n in sorted(reasons.items()))
+    verb = "was" if given - count == 1 else "were"
+    return f"{given - count} of {given} photos {verb} not used{f' ({why})' if why else ''}."
+
+
+def mm(value: float, digits: int = 3) -> str:
+    """A length in mm as text; a dash where it is not known."""
+    return f"{value:.{digits}f}" if math.isfinite(value) else "–"
+
+
+def _rounded(value: float) -> str:
+    """To one significant digit, as one would say it."""
+    if value <= 0:
+        return "0"
+    digits = max(0, -math.floor(math.log10(value)))
+    return f"{value:.{digits}f}"
+
+
+def _listed(names: list[str], most: int = 6) -> str:
+    shown = ", ".join(names[:most])
+    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"

