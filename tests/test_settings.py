@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 
 from specimap.core.errors import SettingsError
-from specimap.infra.settings import OTHER_VARIABLES, ServiceSettings, load_settings
-from specimap.infra.settings_table import settings_table
+from specimap.core.reconstruct.learned.environment import BACKEND_VARIABLES
+from specimap.infra.settings import OTHER_VARIABLES, ServiceSettings, known_variables, load_settings
+from specimap.infra.settings_table import backends_table, page_part, settings_table
 
 ROOT = Path(__file__).parents[1]
 
@@ -115,6 +116,29 @@ def test_variables_with_the_prefix_that_are_no_settings_are_let_be(monkeypatch: 
     assert load_settings().port == 8765
 
 
+def test_variables_of_backends_are_let_be_where_they_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    right = {"DEVICE": "cpu", "GRAPH": "swin-5", "SIZE_PX": "224", "SUBSAMPLE": "4", "SCHEDULE": "50,50",
+             "CONFIDENCE": "2", "BATCH": "4"}  # fmt: skip
+    for name in BACKEND_VARIABLES:
+        monkeypatch.setenv(name, right.get(re.sub(r"SPECIMAP_(MAST3R|DA3|DENSE)_", "", name), "/x"))
+    assert load_settings().port == 8765
+
+
+@pytest.mark.parametrize("name", ["SPECIMAP_MAST3R_GRAPH", "SPECIMAP_DA3_BATCH", "SPECIMAP_DENSE_DEVICE"])
+def test_a_wrong_value_of_a_backends_variable_is_refused_by_its_name(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(name, "many")
+    error = refused()
+    assert error.message == f"{name} is 'many'."
+    assert error.details["setting"] == name
+
+
+def test_a_variable_that_only_looks_like_a_backends_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPECIMAP_MAST3R_WIEGHTS", "/x")
+    assert refused().message == "There is no setting SPECIMAP_MAST3R_WIEGHTS."
+
+
 def test_a_file_with_an_unknown_setting_is_refused_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "specimap.toml"
     file.write_text("prot = 9000\n", "utf-8")
@@ -133,11 +157,11 @@ def test_a_file_that_is_no_toml_or_not_there_is_refused(tmp_path: Path, monkeypa
 # ---- the page -----------------------------------------------------------------------------------------
 
 
-def test_the_page_holds_the_table_as_the_module_prints_it() -> None:
+def test_the_page_holds_the_tables_as_the_module_prints_them() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "specimap.infra.settings_table"], capture_output=True, text=True, check=True, timeout=60
     )
-    assert done.stdout == settings_table() + "\n"
+    assert done.stdout == page_part() + "\n"
     page = (ROOT / "docs" / "settings.md").read_text("utf-8")
     assert done.stdout in page, "print it anew: python -m specimap.infra.settings_table"
 
@@ -148,6 +172,12 @@ def test_the_table_lists_every_setting_once_with_its_meaning() -> None:
     for _, _, takes, meaning in rows:
         assert takes
         assert meaning.endswith(".")
+
+
+def test_the_table_of_backends_lists_every_variable_with_its_meaning() -> None:
+    rows = re.findall(r"^\| `(SPECIMAP_\w+)` \| ([^|]+\.) \|$", backends_table(), re.MULTILINE)
+    assert [name for name, _ in rows] == list(BACKEND_VARIABLES)
+    assert {"SPECIMAP_MAST3R_WEIGHTS", "SPECIMAP_DA3_WEIGHTS", "SPECIMAP_DENSE_DEVICE"} < set(BACKEND_VARIABLES)
 
 
 def test_the_tables_cells_say_what_the_settings_say() -> None:
@@ -161,7 +191,8 @@ def test_the_tables_cells_say_what_the_settings_say() -> None:
 
 
 def test_all_variables_that_pages_and_images_name_exist() -> None:
-    known = {f"SPECIMAP_{name.upper()}" for name in ServiceSettings.model_fields} | OTHER_VARIABLES
+    prefixes = {"SPECIMAP_MAST3R_", "SPECIMAP_DA3_"}  # a page's table lists what follows them
+    known = known_variables() | prefixes
     docker = [file for folder in ("docker", "docker/proxy") for file in (ROOT / folder).glob("*") if file.is_file()]
     files = [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *docker]
     for file in files:

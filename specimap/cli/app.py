@@ -11,8 +11,11 @@ from typing import Annotated
 import typer
 
 from specimap import __version__
+from specimap.cli.doctor import doctor
+from specimap.cli.evidence import study_app, validate
 from specimap.cli.keys import keys_app
 from specimap.cli.progress import Listener, json_listener, progress_listener
+from specimap.cli.report import report
 from specimap.cli.telling import Debug, stoppable, told
 from specimap.core.errors import NotFoundError
 
@@ -62,6 +65,8 @@ class Format(StrEnum):
     npz = "npz"
     envi = "envi"
     csv = "csv"
+    html = "html"
+    pdf = "pdf"
 
 
 class Kind(StrEnum):
@@ -160,7 +165,8 @@ def export(
 
         cloud = Cloud.open(out / "cloud.zarr")
         suffix = "hdr" if format is Format.envi else format.value
-        written = export_cloud(cloud, target or out / f"cloud.{suffix}", format.value)
+        stem = "report" if format in (Format.html, Format.pdf) else "cloud"
+        written = export_cloud(cloud, target or out / f"{stem}.{suffix}", format.value)
         if json_events:
             sys.stdout.write(json.dumps({"event": "exported", "path": str(written)}) + "\n")
         else:
@@ -222,6 +228,10 @@ def _root(
     """Photos and one hyperspectral cube of an excised specimen to a metric 3D point cloud with spectra."""
 
 
+app.command()(report)
+app.command()(validate)
+app.command()(doctor)
+app.add_typer(study_app, name="study")
 app.add_typer(keys_app, name="keys")
 
 

@@ -37,10 +37,10 @@ def on_card(xyz: NDArray[np.float32], corners: Floats) -> NDArray[np.bool_]:
 def worth_refining(vertices: NDArray[np.float32], corners: Floats) -> NDArray[np.bool_]:
     """Whether vertices (V, 3) mm may be of the specimen or of a card: the plain tray is most of a mesh, and nobody
     asks for its third digit."""
-    return np.asarray((vertices[:, 2] > _raised_mm(corners) / 2) | on_card(vertices, corners))
+    return np.asarray((vertices[:, 2] > raised_mm(corners) / 2) | on_card(vertices, corners))
 
 
-def _raised_mm(corners: Floats) -> float:
+def raised_mm(corners: Floats) -> float:
     """Height above the marker plane from which on something is the specimen."""
     return SPECIMEN_HEIGHT_SHARE * float(np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0)))
 
@@ -52,7 +52,7 @@ def on_specimen(
     with what touches it in the cube."""
     if not len(xyz):
         return np.zeros(0, bool)
-    raised = (xyz[:, 2] > _raised_mm(corners)) & ~card
+    raised = (xyz[:, 2] > raised_mm(corners)) & ~card
     shape = pixels.max(0).astype(int) + 1
     mask = np.zeros(shape, np.uint8)
     mask[pixels[raised, 0], pixels[raised, 1]] = 1

@@ -10,6 +10,7 @@ from pydantic import Field, ValidationError, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
 
 from specimap.core.errors import SettingsError
+from specimap.core.reconstruct.learned.environment import BACKEND_VARIABLES, check_environment
 
 CONFIG_VARIABLE = "SPECIMAP_CONFIG"
 """Names a TOML file with the same settings, lower case and without the prefix; the environment wins."""
@@ -171,7 +172,7 @@ def load_settings(**given: object) -> ServiceSettings:
             advice="Name a TOML file.",
             setting=CONFIG_VARIABLE,
         )
-    known = {f"SPECIMAP_{name.upper()}" for name in ServiceSettings.model_fields} | OTHER_VARIABLES
+    known = known_variables()
     strange = sorted(name for name in os.environ if name.startswith("SPECIMAP_") and name not in known)
     if strange:
         raise SettingsError(
@@ -179,6 +180,7 @@ def load_settings(**given: object) -> ServiceSettings:
             advice="docs/settings.md lists all; correct the name or remove it.",
             setting=strange[0],
         )
+    check_environment()
     try:
         return ServiceSettings(**given)  # type: ignore[arg-type]
     except ValidationError as error:
@@ -197,3 +199,9 @@ def load_settings(**given: object) -> ServiceSettings:
 
 OTHER_VARIABLES = frozenset({CONFIG_VARIABLE, "SPECIMAP_DEBUG", "SPECIMAP_TEST_DATA", "SPECIMAP_URL", "SPECIMAP_KEY"})
 """Variables with the prefix that are no settings of the service."""
+
+
+def known_variables() -> frozenset[str]:
+    """All variables with the prefix: of the service, of backends and devices, and others."""
+    own = {f"SPECIMAP_{name.upper()}" for name in ServiceSettings.model_fields}
+    return frozenset(own | OTHER_VARIABLES | set(BACKEND_VARIABLES))

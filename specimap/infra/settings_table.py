@@ -1,4 +1,4 @@
-"""``python -m specimap.infra.settings_table``: the table of docs/settings.md, made from the settings themselves."""
+"""``python -m specimap.infra.settings_table``: the tables of docs/settings.md, made from the settings themselves."""
 
 from __future__ import annotations
 
@@ -8,15 +8,31 @@ from typing import Any, Literal, get_args, get_origin
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from specimap.core.reconstruct.learned.environment import BACKEND_VARIABLES
 from specimap.infra.settings import GIB, MIB, ServiceSettings
 
 DATA_DIR = "`$XDG_DATA_HOME/specimap`, else `~/.local/share/specimap`"
 HEADER = "| variable | default | takes | meaning |\n|---|---|---|---|"
+OF_BACKENDS = (
+    "Of backends and devices, for `specimap worker`, `serve` and `run` alike; from the environment alone, not from the "
+    "file.\nDefaults and what they take: [backends.md](backends.md)."
+)
 
 
 def settings_table() -> str:
     """All settings as a Markdown table, one a line, in the order of the class."""
     return "\n".join([HEADER, *(_row(name, field) for name, field in ServiceSettings.model_fields.items())])
+
+
+def backends_table() -> str:
+    """The variables of backends and devices as a Markdown table, one a line."""
+    rows = (f"| `{name}` | {meaning} |" for name, meaning in BACKEND_VARIABLES.items())
+    return "\n".join(["| variable | meaning |\n|---|---|", *rows])
+
+
+def page_part() -> str:
+    """Both tables, as docs/settings.md holds them."""
+    return f"{settings_table()}\n\n{OF_BACKENDS}\n\n{backends_table()}"
 
 
 def _row(name: str, field: FieldInfo) -> str:
@@ -61,4 +77,4 @@ def _limits(field: FieldInfo) -> list[tuple[str, object]]:
 
 
 if __name__ == "__main__":
-    print(settings_table())
+    print(page_part())

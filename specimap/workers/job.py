@@ -257,12 +257,7 @@ class JobRun:
 
     async def _planned(self) -> Plan:
         if self._plan is None:
-
-            def plan() -> Plan:
-                with self._database.session() as session:
-                    return plan_of(session, self.job_id)
-
-            self._plan = await self._thread(plan)
+            self._plan = await self._thread(plan_of, self._database, self.job_id)
         return self._plan
 
     def _artefacts(self, plan: Plan) -> Artefacts:

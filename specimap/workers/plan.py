@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy.orm import Session
 
 from specimap.core.errors import NotFoundError
 from specimap.core.pipeline.keys import digest_of, register_key, surface_keys
 from specimap.core.pipeline.settings import settings_from
+from specimap.infra.database import Database
 from specimap.infra.models import Acquisition, Job, StoredFile
 from specimap.infra.storage import Storage
 
@@ -55,20 +55,23 @@ class Plan:
                 storage.fetch(key, folder / place)
 
 
-def plan_of(session: Session, job_id: str) -> Plan:
+def plan_of(database: Database, job_id: str) -> Plan:
     """The plan of a job.
 
     Raises:
         NotFoundError: the job, or its acquisition's cube or photos, are gone.
         SettingsError, UnknownDictionaryError: the job's settings cannot be.
+        BackendUnavailableError: the job's backend, or its weights, are not on this machine.
     """
-    job = session.get_one(Job, job_id)
-    acquisition = session.get_one(Acquisition, job.acquisition_id)
-    rows = session.scalars(
-        sa.select(StoredFile)
-        .where(StoredFile.acquisition_id == acquisition.id, StoredFile.state == "accepted")
-        .order_by(StoredFile.label)
-    ).all()
+    with database.session() as session:
+        job = session.get_one(Job, job_id)
+        acquisition = session.get_one(Acquisition, job.acquisition_id)
+        rows = session.scalars(
+            sa.select(StoredFile)
+            .where(StoredFile.acquisition_id == acquisition.id, StoredFile.state == "accepted")
+            .order_by(StoredFile.label)
+        ).all()
+    # Out of the transaction: the hash of a backend's weights takes seconds the first time.
     files = {f"{'photos' if row.role == 'photo' else row.role}/{row.label}": row.storage_key for row in rows}
     photos = {row.label: row.sha256 for row in rows if row.role == "photo"}
     cube = {row.label: row.sha256 for row in rows if row.role != "photo"}

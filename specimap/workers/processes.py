@@ -13,19 +13,15 @@ from contextlib import suppress
 from typing import Any
 
 from specimap.core.errors import SpecimapError
+from specimap.core.reconstruct.learned.environment import BACKEND_VARIABLES
+from specimap.core.reconstruct.learned.environment import bare_environment as bare_environment
 from specimap.infra.errors import StageTimeoutError
 
 COMMAND = (sys.executable, "-m", "specimap.workers.stage_main")
 LAST_LINES = 40
 SPARES = 2
 """One for the next stage and one for that after it: rendering takes a tenth of a second, less than an import."""
-SECRET = ("SPECIMAP_", "AWS_", "PG")
 LINE_LIMIT = 1 << 20
-
-
-def bare_environment() -> dict[str, str]:
-    """The environment without what it tells of database and storage: a process that reads uploads sees no password."""
-    return {name: value for name, value in os.environ.items() if not name.startswith(SECRET)}
 
 
 class StageCrashedError(Exception):
@@ -64,7 +60,8 @@ class StageProcess:
             limit=LINE_LIMIT,
             # A group of its own: a kill reaches whatever it starts, and the terminal's signals do not reach it.
             start_new_session=True,
-            env=bare_environment(),
+            # A process that reads uploads sees no password, and of our variables what tells of backends alone.
+            env=bare_environment(BACKEND_VARIABLES),
         )
         return cls(process)
 

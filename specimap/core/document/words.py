@@ -37,6 +37,15 @@ REMARKS = {
     "byte_order_assumed": "Look whether the spectra are plausible; export the cube with its byte order.",
     "axes_assumed": "Look whether the picture is that of the specimen; export the cube with named axes.",
     "data_longer_than_header": "Check the export: the file holds more than its header says.",
+    "focal_breathing": "Nothing for this result. Lock the focus while taking photos, where the camera can.",
+    "features_chosen": "Show two or more markers in every photo; poses from markers are the more exact ones.",
+    "specimen_moved": "Do not rely on places: photograph and record again, and touch nothing in between.",
+    "cube_camera_loose": "Show all four markers in the cube, sharper if you can, or tilt the camera a little.",
+    "dense_on_gpu": "Nothing: it says where depth was measured.",
+    "dense_gpu_failed": "Nothing for this result. Have the worker's GPU looked at, or set it to use the CPU.",
+    "backend_run": "Nothing: keep it with the result, so that it can be repeated.",
+    "depth_unaligned": "Show two or more markers in the photos that are named, or run the default backend.",
+    "licence_apache": "Nothing: the licence allows any use.",
     "licence_non_commercial": "Use this result for no commercial purpose; run the default backend for any other.",
 }
 UNKNOWN_REMARK = "Read it before using the result; the documentation of errors and warnings says more."

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from specimap import __version__
 from specimap.core.accuracy import CornersInCube, camera_figures, homography_figures, spread
-from specimap.core.acquisition import RECOMMENDED_PHOTOS
 from specimap.core.adjust import Adjusted, triangulate
 from specimap.core.cloud import Cloud, CloudPoints, Flag
 from specimap.core.cloud.writer import write_cloud
@@ -25,12 +24,13 @@ from specimap.core.pipeline.artefacts import Stage1, Stage2
 from specimap.core.pipeline.clock import Clock
 from specimap.core.pipeline.corners import cube_corners, photo_corners
 from specimap.core.pipeline.outputs import Outputs, staged
+from specimap.core.pipeline.remarks import remarks_of
 from specimap.core.pipeline.settings import PipelineSettings
 from specimap.core.pipeline.stages import all_refused
 from specimap.core.points import cloud_points
 from specimap.core.preview import write_preview
 from specimap.core.raycast import RayCaster
-from specimap.core.register.camera import CubeCamera, solve_camera
+from specimap.core.register.camera import CubeCamera
 from specimap.core.register.cube_markers import CubeMarkers, find_markers
 from specimap.core.register.register import (
     Placement,
@@ -39,6 +39,7 @@ from specimap.core.register.register import (
     place_by_camera,
     place_by_homography,
 )
+from specimap.core.register.settle import settle_camera
 from specimap.core.render import Grid
 from specimap.core.report import (
     Coverage,
@@ -55,9 +56,6 @@ from specimap.core.report import (
 )
 
 CUBE_CORNER_FLOOR_PX = 0.03
-SUBJECT_DISAGREES = 2.0
-PLAUSIBLE_DISTANCE_MM = (50.0, 1200.0)
-"""A phone does not focus nearer; and nobody photographs a specimen between markers from farther."""
 
 
 def register_and_write(
@@ -114,8 +112,8 @@ def _register(
     found = find_markers(cube, settings.reconstruct.dictionary, adjusted.marker_ids)
     progress(0.1)
     seen = _corners_in_cube(found, adjusted, cube.cols)
-    flat = seen.flat()
-    camera = solve_camera(*flat, cube.rows, cube.cols)
+    settled = settle_camera(seen, found, cube.rows, cube.cols, caster, adjusted.corners)
+    camera, flat = settled.camera, seen.flat()
     homography = fit_homography(flat[0], flat[1], coarse, settings.register.ransac_px)
     by_camera = settings.register.method == "camera"
     chosen = (
@@ -137,7 +135,7 @@ def _register(
         stage2.sigma_mm.astype(np.float32),
         adjusted.corners,
         float(np.median(adjusted.sigma_corner_mm)),
-        camera.sideways_mm,
+        settled.sideways_mm,
         camera.pixel_mm,
         None if by_camera else apart,
     )
@@ -184,7 +182,10 @@ def _register(
         photo_focal_px=adjusted.lens.focal_px,
         seconds=dict(clock.seconds),
         reused_stages=list(clock.reused),
-        warnings=[Remark(code=c, message=m) for c, m in [*remarks, *_remarks(stage1, adjusted, found)]],
+        warnings=[
+            Remark(code=c, message=m)
+            for c, m in [*remarks, *remarks_of(stage1, adjusted, found), *settled.remarks()]
+        ],
         settings=settings.as_dict(),
         inputs=inputs,
         photo_corners=photo_corners(stage1, adjusted),
@@ -265,36 +266,3 @@ def _camera(camera: CubeCamera, found: CubeMarkers, cube: Cube) -> CubeCameraFig
         mirrored=found.mirrored,
         markers_found_in=found.where,
     )
-
-
-def _remarks(stage1: Stage1, adjusted: Adjusted, found: CubeMarkers) -> list[tuple[str, str]]:
-    remarks: list[tuple[str, str]] = list(stage1.reconstruction.remarks)
-    used = len(stage1.reconstruction.photos)
-    if used < RECOMMENDED_PHOTOS:
-        remarks.append(("few_photos", f"{used} photos were used; {RECOMMENDED_PHOTOS} or more are recommended."))
-    missing = sorted(set(adjusted.marker_ids) - set(found.marker_ids))
-    if missing and len(adjusted.marker_ids) <= 8:
-        text = f"Marker {', '.join(map(str, missing))} does not show in the cube: {4 * len(found.marker_ids)} "
-        remarks.append(("markers_missing_in_cube", text + "correspondences are left."))
-    if found.where != "band mean":
-        remarks.append(("markers_not_in_band_mean", f"The markers show best in the {found.where}."))
-    if found.mirrored:
-        remarks.append(
-            ("cube_mirrored", "The cube is mirrored, as its markers show; columns were counted from the other side.")
-        )
-    distance = float(np.median([p.centre[2] for p in adjusted.poses]))
-    reach = [float(np.linalg.norm(p.centre)) for p in adjusted.poses]
-    low, high = PLAUSIBLE_DISTANCE_MM
-    if not low < np.median(reach) < high:
-        remarks.append(
-            ("scale_implausible", f"With this marker edge the photos were taken {distance:.0f} mm above the markers.")
-        )
-    if stage1.subject_mm:
-        ratio = float(np.median(reach)) / stage1.subject_mm
-        if not 1 / SUBJECT_DISAGREES < ratio < SUBJECT_DISAGREES:
-            remarks.append(
-                ("scale_contradicts_exif",
-                 f"The photos' EXIF says {stage1.subject_mm:.0f} mm to the subject, the marker edge "
-                 f"{np.median(reach):.0f} mm: check the edge.")
-            )  # fmt: skip
-    return remarks

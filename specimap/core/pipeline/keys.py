@@ -9,14 +9,23 @@ from dataclasses import asdict
 
 from specimap.core.pipeline.artefacts import key_of
 from specimap.core.pipeline.settings import PipelineSettings
+from specimap.core.reconstruct.learned.environment import backend_identity
 
 
 def surface_keys(photos: Mapping[str, str], settings: PipelineSettings) -> dict[str, str]:
-    """Keys of the stages that the cube has no part in; ``photos``: names with the hashes of the files."""
+    """Keys of the stages that the cube has no part in; ``photos``: names with the hashes of the files.
+
+    A backend with a network adds its variables and the hash of its weights, so it is to be called where these are.
+
+    Raises:
+        BackendUnavailableError: that backend's code or weights are not there.
+        SettingsError: one of its variables has a value that cannot be.
+    """
+    identity = backend_identity(settings.reconstruct.backend)
     reconstruct = key_of(
         "reconstruct",
         {"photos": dict(photos), "acquisition": asdict(settings.acquisition), "s": asdict(settings.reconstruct),
-         "edge_mm": settings.adjust.edge_mm},
+         "edge_mm": settings.adjust.edge_mm, **({"backend": identity} if identity else {})},
     )  # fmt: skip
     adjust = key_of(
         "adjust",

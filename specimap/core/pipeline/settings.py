@@ -10,6 +10,8 @@ from specimap.core.adjust import AdjustSettings, Form
 from specimap.core.errors import SettingsError
 from specimap.core.fiducials import dictionary_named
 from specimap.core.reconstruct.backend import FeatureChoice, ReconstructSettings
+from specimap.core.reconstruct.depth import DepthSettings, Device
+from specimap.core.reconstruct.learned.environment import DEVICES, dense_device
 from specimap.core.refine import RefineSettings
 from specimap.core.register.register import Method, RegisterSettings
 from specimap.core.render import RenderSettings
@@ -54,6 +56,7 @@ class PipelineSettings:
         choices = {
             "backend": (self.reconstruct.backend, BACKENDS),
             "features": (self.reconstruct.features, FEATURES),
+            "device": (self.reconstruct.depth.device, DEVICES),
             "method": (self.register.method, ("camera", "homography")),
             "adjustment": (self.adjust.form, ("rigid", "free")),
         }
@@ -80,7 +83,7 @@ def settings_from(
     features: str,
     working_px: int,
 ) -> PipelineSettings:
-    """Settings of a run from the few that a person chooses, checked.
+    """Settings of a run from the few that a person chooses, checked; the environment names the device for dense stereo.
 
     Raises:
         SettingsError, UnknownDictionaryError: see :meth:`PipelineSettings.check`.
@@ -88,7 +91,11 @@ def settings_from(
     settings = PipelineSettings(
         acquisition=AcquisitionSettings(working_px=working_px),
         reconstruct=ReconstructSettings(
-            dictionary=dictionary, edge_mm=edge_mm, backend=backend, features=cast(FeatureChoice, features)
+            dictionary=dictionary,
+            edge_mm=edge_mm,
+            backend=backend,
+            features=cast(FeatureChoice, features),
+            depth=DepthSettings(device=cast(Device, dense_device())),
         ),
         adjust=AdjustSettings(form=cast(Form, adjustment), edge_mm=edge_mm),
         render=RenderSettings(r_reg_mm=r_reg, r_pc_mm=r_pc),

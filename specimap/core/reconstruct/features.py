@@ -154,7 +154,7 @@ def check_features(choice: str) -> None:
     if missing:
         raise BackendUnavailableError(
             f"ALIKED needs {', '.join(missing)}, which this installation lacks.",
-            advice="Install it: pip install 'specimap[learned]'; or leave the choice to --features auto.",
+            advice="Install it: make learned; or leave the choice to --features auto.",
             missing=missing,
         )
 

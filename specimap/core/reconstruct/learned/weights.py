@@ -6,10 +6,15 @@ import functools
 import hashlib
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from specimap.core.errors import BackendUnavailableError
+from specimap.core.errors import BackendUnavailableError, SpecimapError
+from specimap.core.files import write_text
+
+KEPT_FROM_BYTES = 64 * 1024**2
+"""Files from this size on are read once for all programs: a smaller one takes a tenth of a second."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +74,7 @@ def pin_of(text: str | None, variable: str) -> str | None:
         BackendUnavailableError: it is not a sha256, and so would never match.
     """
     pin = (text or "").strip().lower()
-    if pin and not (len(pin) == 64 and set(pin) <= set("0123456789abcdef")):
+    if pin and not _is_sha256(pin):
         raise BackendUnavailableError(
             f"{variable}_SHA256 is not a sha256: {pin[:80]!r}.",
             advice="Give the 64 hexadecimal digits that `sha256sum FILE` prints.",
@@ -78,15 +83,42 @@ def pin_of(text: str | None, variable: str) -> str | None:
 
 
 def sha256_of(path: Path) -> str:
-    """The file's sha256, computed once for a file that does not change."""
+    """The file's sha256, computed once for a file whose path, size and time of change stay the same.
+
+    That of a large file is kept in the user's cache folder, where that can be written.
+    """
     status = os.stat(path)
     return _sha256(str(path.resolve()), status.st_size, status.st_mtime_ns)
 
 
 @functools.lru_cache(maxsize=16)
 def _sha256(path: str, size: int, mtime_ns: int) -> str:
+    note = _note(path, size, mtime_ns) if size >= KEPT_FROM_BYTES else None
+    if note is not None:
+        with suppress(OSError, ValueError):
+            kept = note.read_text("ascii")
+            if _is_sha256(kept):
+                return kept
     with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    if note is not None:
+        with suppress(OSError, SpecimapError):
+            write_text(note, digest)
+    return digest
+
+
+def _note(path: str, size: int, mtime_ns: int) -> Path | None:
+    """Where the sha256 of that file is kept; None without a home."""
+    try:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:
+        return None
+    told = hashlib.sha256(f"{path}\n{size}\n{mtime_ns}".encode(errors="surrogateescape")).hexdigest()
+    return folder / "specimap" / "weights" / told[:32]
+
+
+def _is_sha256(text: str) -> bool:
+    return len(text) == 64 and set(text) <= set("0123456789abcdef")
 
 
 def named_path(variable: str, environment: Mapping[str, str] = os.environ) -> Path | None:

@@ -59,6 +59,11 @@ class Mast3rSettings:
     confidence: float = 1.5
     cache: Path | None = None
 
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """What the interpreter must be able to import."""
+        return MODULES
+
     def pairs(self, count: int) -> list[tuple[int, int]]:
         """Pairs of photos that the network compares, lower index first."""
         kind = self.graph

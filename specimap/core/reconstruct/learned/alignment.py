@@ -1,4 +1,4 @@
-"""Scale for a network's depth: fitted to places whose true depth is known.
+"""Scale for a network's depth: fitted to places whose true depth is known, such as those on the markers.
 
 The network's depth d of one view is right up to a scale, and at times a shift of its inverse: 1 / z = a / d + b.
 With z known, ``z (a / d + b) = 1`` is linear in a and b, and its residual is the share by which the depth is off.
@@ -10,11 +10,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import map_coordinates
 
-from specimap.core.geometry import Floats
+from specimap.core.geometry import Floats, View
 from specimap.core.reconstruct.depth import Singles
+from specimap.core.solver import Observations
 
+MARKER_STEPS = 6
+"""Known places along a marker's edge: about as many on four markers as features on a specimen."""
+MARKER_INSET = 0.08
+"""Share of the edge left out: the network rounds the card's border."""
 TRIALS = 300
 NEAR = 0.015
 """Share of the depth within which a place supports a trial: 2 mm at 150 mm."""
@@ -28,10 +33,6 @@ SHIFT_GAIN = 0.8
 """A shift must bring the scatter below this share of what the scale alone leaves."""
 SHIFT_SPREAD = 0.05
 """Known depths must differ by this share of their middle for a shift to be told from a scale."""
-REACH = 0.025
-"""Sd of the kernel that spreads what known places show, as a share of the picture's longer side: 2 mm on a specimen."""
-DOUBT = 3.0
-"""As many places as this that show no error are added everywhere."""
 ROUNDS = 20
 TUKEY = 4.685
 SIGMA_OF_MAD = 1.4826
@@ -57,6 +58,26 @@ class Alignment:
         d = depth.astype(float)
         inverse = self.a / np.where(d > 0, d, 1) + self.b
         return np.where((d > 0) & (inverse > 0), 1 / np.where(inverse > 0, inverse, 1), 0).astype(np.float32)
+
+
+def depths_at(points: Floats, view: View, network: Singles) -> tuple[Floats, Floats, Floats]:
+    """Pixels (M, 2), the network's depth and the true one (M,) of those ``points`` (N, 3) mm that lie in the view."""
+    cam = view.cam_from_world.apply(points)
+    cam = cam[cam[:, 2] > 0]
+    at = view.intrinsics.project(cam)
+    height, width = network.shape
+    inside = (at >= 0).all(1) & (at[:, 0] <= width - 1) & (at[:, 1] <= height - 1)
+    found = map_coordinates(network, at[inside, ::-1].T, order=1, mode="nearest")
+    return at[inside], np.asarray(found, float), cam[inside, 2]
+
+
+def on_markers(corners: Floats, seen: Observations, photo: int) -> Floats:
+    """Places (N, 3) mm inside the markers that a photo shows; ``corners`` (Q, 4, 3) by ``seen.marker``."""
+    steps = np.linspace(MARKER_INSET, 1 - MARKER_INSET, MARKER_STEPS)
+    u, v = (g.ravel()[:, None] for g in np.meshgrid(steps, steps))
+    weights = np.concatenate([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v], 1)
+    shown = np.unique(seen.marker[seen.photo == photo])
+    return np.asarray(weights @ corners[shown]).reshape(-1, 3)
 
 
 def align(network: Floats, true: Floats, *, seed: int = 0) -> Alignment | None:
@@ -86,32 +107,6 @@ def align(network: Floats, true: Floats, *, seed: int = 0) -> Alignment | None:
     if scatter > min(LARGEST_SCATTER, LEAST_TOLD * flat):
         return None
     return Alignment(a, b, scatter, int(near.sum()), len(d))
-
-
-def bend(depth: Singles, at: Floats, true: Floats) -> tuple[Singles, float]:
-    """Aligned depth (H, W) mm drawn to true depths (N,) mm at pixels (N, 2), and the scatter that is left.
-
-    A network's error changes slowly over the picture. Its share of the depth, as the known places show it, is averaged
-    over :data:`REACH` of the picture and taken off; where no place is known nothing changes.
-    """
-    found = map_coordinates(depth, at[:, ::-1].T, order=1, mode="nearest")
-    known = found > 0
-    column, row = np.rint(at[known]).astype(int).T
-    off = true[known] / found[known] - 1
-    reach = REACH * max(depth.shape)
-    if not len(off):
-        return depth.copy(), np.inf
-    # A poor network is off by more than what tells false matches from true ones about a good one.
-    near = np.abs(off) < max(2 * NEAR, 3 * SIGMA_OF_MAD * float(np.median(np.abs(off))))
-    total, count = (np.zeros(depth.shape) for _ in range(2))
-    np.add.at(total, (row[near], column[near]), off[near])
-    np.add.at(count, (row[near], column[near]), 1.0)
-    # Times the kernel's area, the smoothed count is the number of places within reach.
-    area = 2 * np.pi * reach**2
-    total, count = (area * gaussian_filter(v, reach, mode="constant") for v in (total, count))
-    field = total / (count + DOUBT)
-    scatter = SIGMA_OF_MAD * float(np.median(np.abs(off - field[row, column])[near]))
-    return (depth * (1 + field)).astype(np.float32), scatter
 
 
 def _robust(rows: Floats, rng: np.random.Generator) -> tuple[Floats, float, NDArray[np.bool_]]:

@@ -1,0 +1,48 @@
+"""What the reader of a report should know of the photos, the scale and the cube's markers."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from specimap.core.acquisition import RECOMMENDED_PHOTOS
+from specimap.core.adjust import Adjusted
+from specimap.core.pipeline.artefacts import Stage1
+from specimap.core.register.cube_markers import CubeMarkers
+
+SUBJECT_DISAGREES = 2.0
+PLAUSIBLE_DISTANCE_MM = (50.0, 1200.0)
+"""A phone does not focus nearer; and nobody photographs a specimen between markers from farther."""
+
+
+def remarks_of(stage1: Stage1, adjusted: Adjusted, found: CubeMarkers) -> list[tuple[str, str]]:
+    """Codes and sentences."""
+    remarks: list[tuple[str, str]] = list(stage1.reconstruction.remarks)
+    used = len(stage1.reconstruction.photos)
+    if used < RECOMMENDED_PHOTOS:
+        remarks.append(("few_photos", f"{used} photos were used; {RECOMMENDED_PHOTOS} or more are recommended."))
+    missing = sorted(set(adjusted.marker_ids) - set(found.marker_ids))
+    if missing and len(adjusted.marker_ids) <= 8:
+        text = f"Marker {', '.join(map(str, missing))} does not show in the cube: {4 * len(found.marker_ids)} "
+        remarks.append(("markers_missing_in_cube", text + "correspondences are left."))
+    if found.where != "band mean":
+        remarks.append(("markers_not_in_band_mean", f"The markers show best in the {found.where}."))
+    if found.mirrored:
+        remarks.append(
+            ("cube_mirrored", "The cube is mirrored, as its markers show; columns were counted from the other side.")
+        )
+    distance = float(np.median([p.centre[2] for p in adjusted.poses]))
+    reach = [float(np.linalg.norm(p.centre)) for p in adjusted.poses]
+    low, high = PLAUSIBLE_DISTANCE_MM
+    if not low < np.median(reach) < high:
+        remarks.append(
+            ("scale_implausible", f"With this marker edge the photos were taken {distance:.0f} mm above the markers.")
+        )
+    if stage1.subject_mm:
+        ratio = float(np.median(reach)) / stage1.subject_mm
+        if not 1 / SUBJECT_DISAGREES < ratio < SUBJECT_DISAGREES:
+            remarks.append(
+                ("scale_contradicts_exif",
+                 f"The photos' EXIF says {stage1.subject_mm:.0f} mm to the subject, the marker edge "
+                 f"{np.median(reach):.0f} mm: check the edge.")
+            )  # fmt: skip
+    return remarks

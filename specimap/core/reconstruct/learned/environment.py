@@ -1,0 +1,91 @@
+"""What the environment says of backends and of the device for dense stereo: all its variables, in one place.
+
+The service's settings and the process of a stage read it, so nothing heavy is imported here.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Mapping
+from dataclasses import asdict
+
+from specimap.core.errors import SettingsError
+from specimap.core.reconstruct.da3 import settings as da3
+from specimap.core.reconstruct.learned.weights import Weights
+from specimap.core.reconstruct.mast3r import settings as mast3r
+
+DENSE_DEVICE = "SPECIMAP_DENSE_DEVICE"
+DEVICES = ("auto", "cpu", "gpu")
+BACKEND_VARIABLES: dict[str, str] = {
+    **{mast3r.PREFIX + name: meaning for name, meaning in mast3r.VARIABLES.items()},
+    **{da3.PREFIX + name: meaning for name, meaning in da3.VARIABLES.items()},
+    DENSE_DEVICE: "Where the default backend measures depth: auto, cpu or gpu; auto takes a GPU where there is one.",
+}
+"""Variable, and what it is."""
+SECRETS = ("SPECIMAP_", "AWS_", "PG")
+"""How the names of variables begin that may hold keys, or addresses of database and storage."""
+NOT_IN_IDENTITY = ("cache", "weights")
+"""Fields that leave the result as it is: where scratch files lie, and the path of weights whose sha256 counts."""
+
+
+def bare_environment(keep: Collection[str] = ()) -> dict[str, str]:
+    """The environment without :data:`SECRETS`, but for the variables to ``keep``."""
+    return {name: value for name, value in os.environ.items() if name in keep or not name.startswith(SECRETS)}
+
+
+def dense_device(environment: Mapping[str, str] = os.environ) -> str:
+    """One of :data:`DEVICES`.
+
+    Raises:
+        SettingsError: the variable says something else.
+    """
+    device = environment.get(DENSE_DEVICE, "").strip() or DEVICES[0]
+    if device not in DEVICES:
+        raise SettingsError(
+            f"{DENSE_DEVICE} is {device!r}.", advice=f"It takes one of: {', '.join(DEVICES)}.", setting=DENSE_DEVICE
+        )
+    return device
+
+
+def check_environment(environment: Mapping[str, str] = os.environ) -> None:
+    """Refuse values that cannot be, whichever backend a run will take. Looks at no file.
+
+    Raises:
+        SettingsError: details name the variable.
+    """
+    mast3r.settings_from_environment(environment)
+    da3.settings_from_environment(environment)
+    dense_device(environment)
+
+
+def backend_found(
+    name: str, environment: Mapping[str, str] = os.environ
+) -> tuple[mast3r.Mast3rSettings | da3.Da3Settings, Weights] | None:
+    """Settings and weights of a backend with a network; None for others.
+
+    Raises:
+        SettingsError: a variable's value cannot be.
+        BackendUnavailableError: its code or its weights are not there, or not the pinned ones.
+    """
+    if name == mast3r.NAME:
+        chosen = mast3r.settings_from_environment(environment)
+        mast3r.check_home(chosen.home)
+        return chosen, mast3r.weights_of(chosen)
+    if name == da3.NAME:
+        own = da3.settings_from_environment(environment)
+        own.code_path()
+        return own, own.find_weights()
+    return None
+
+
+def backend_identity(name: str, environment: Mapping[str, str] = os.environ) -> dict[str, object] | None:
+    """What a result of the backend depends on beside a run's own settings: its variables, and the weights' sha256.
+
+    None for a backend that has neither. Raises as :func:`backend_found` does.
+    """
+    found = backend_found(name, environment)
+    if found is None:
+        return None
+    chosen, weights = found
+    settings = {field: value for field, value in asdict(chosen).items() if field not in NOT_IN_IDENTITY}
+    return {"settings": settings, "weights": weights.sha256}

@@ -1,0 +1,97 @@
+"""The cube's camera from the markers, and from the specimen where they leave it open.
+
+Sixteen nearly coplanar corners give the plane's place in the cube to a few hundredths of a pixel, but the direction
+of sight and the focal length only as far as perspective shows. Where that is too little for tissue that stands above
+the plane (a marker out of view, blurred corners), the photos' own picture of the specimen decides.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from specimap.core.accuracy import CornersInCube
+from specimap.core.geometry import Floats
+from specimap.core.points import raised_mm
+from specimap.core.raycast import RayCaster
+from specimap.core.register.camera import Anchor, CubeCamera, solve_camera
+from specimap.core.register.cube_markers import CubeMarkers
+from specimap.core.register.motion import LEAST_MARKERS, SHARED_MM, Shift, specimen_shift
+
+LOOSE_MM = 0.15
+"""Sideways standard deviation at the specimen from which on the markers' word is not enough."""
+EXPLAINED_BY_CAMERA = 3.0
+"""A shift within so many standard deviations of the camera is the camera's, not the specimen's."""
+ROUNDS = 3
+SAMPLE = 500
+
+
+@dataclass(frozen=True)
+class Settled:
+    """The solved ``camera``; ``open_mm``: how far the markers leave open, sideways, where the specimen lies, one
+    standard deviation; ``by_specimen``: whether the specimen had a say; ``shift`` that is left, if it can be told."""
+
+    camera: CubeCamera
+    open_mm: float
+    by_specimen: bool
+    shift: Shift | None
+
+    @property
+    def sideways_mm(self) -> float:
+        """Sideways standard deviation of a registered pixel of the specimen."""
+        if self.shift is not None and self.shift.significant:
+            return self.shift.moved_mm  # whoever moved it, the spectra lie beside their places by this much
+        if self.by_specimen and self.shift is not None:
+            return float(np.hypot(self.shift.sigma_mm, SHARED_MM))
+        misfit = self.camera.rms_px * self.camera.pixel_mm
+        # Corners that hold the camera well leave less than their formal share; the misfit itself is of that size.
+        return max(misfit, self.open_mm) if self.open_mm > LOOSE_MM else misfit
+
+    def remarks(self) -> list[tuple[str, str]]:
+        """What the report should say of it."""
+        said: list[tuple[str, str]] = []
+        if self.shift is not None and self.shift.significant:
+            said.append(("specimen_moved", self.shift.message))
+        if self.sideways_mm > LOOSE_MM:
+            text = f"The markers in the cube leave open where raised tissue lies, by about {self.sideways_mm:.1f} mm."
+            said.append(("cube_camera_loose", text))
+        return said
+
+
+def settle_camera(
+    seen: CornersInCube, found: CubeMarkers, rows: int, cols: int, caster: RayCaster, corners: Floats
+) -> Settled:
+    """Solve the cube's camera on the corners ``seen``; ``found``: the markers with the image they show in;
+    ``corners`` (Q, 4, 3) mm of all markers.
+
+    Raises:
+        RegistrationError: no camera above the plane sees the corners there.
+    """
+    flat = seen.flat()
+    camera = solve_camera(*flat, rows, cols)
+    vertices = caster.mesh.vertices
+    raised = vertices[vertices[:, 2] > raised_mm(corners)].astype(float)
+    if not len(raised):
+        return Settled(camera, camera.sideways_mm(flat[0]), False, None)
+    sample = raised[:: max(1, len(raised) // SAMPLE)]
+    left_open, settled = camera.sideways_mm(sample), False
+    markers = len(seen.marker_ids)
+
+    def look(camera: CubeCamera, markers: int) -> Shift | None:
+        return specimen_shift(
+            found.image, camera.view, caster, corners, markers_in_cube=markers, mirrored=found.mirrored
+        )
+
+    for _ in range(ROUNDS if left_open > LOOSE_MM else 0):
+        # However few the markers: it is the camera that is in question here.
+        shift = look(camera, max(markers, LEAST_MARKERS))
+        if shift is None or shift.moved_mm > EXPLAINED_BY_CAMERA * left_open:
+            break
+        centre = sample.mean(0)
+        across = np.array([*shift.shift_mm, 0.0])
+        pixel = camera.view.project((centre + across)[None])[0]
+        sigma_px = max(shift.sigma_mm, SHARED_MM) / camera.pixel_mm
+        camera = solve_camera(*flat, rows, cols, anchor=Anchor(centre, pixel, sigma_px))
+        settled = True
+    return Settled(camera, left_open, settled, look(camera, max(markers, LEAST_MARKERS) if settled else markers))

@@ -1,0 +1,164 @@
+"""Refinement in passes: what moves, what is reported, how far it goes, and whether truth comes nearer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matched_scene import Matched, matched
+from numpy.typing import NDArray
+
+from specimap.core.errors import CancelledError
+from specimap.core.points import worth_refining
+from specimap.core.refine import Pass, Refined, RefineSettings, refine_mesh
+from specimap.core.surface import Mesh
+
+SEEDS = (31, 32)
+SETTINGS = RefineSettings()
+FIRST = replace(SETTINGS, passes=SETTINGS.passes[:1])
+
+
+def refined(scene: Matched, settings: RefineSettings = SETTINGS, worth: NDArray[np.bool_] | None = None) -> Refined:
+    return refine_mesh(
+        scene.mesh, scene.greys, scene.lens, scene.poses, scene.voxel_mm, settings, workers=2, worth=worth
+    )
+
+
+def tissue(scene: Matched) -> NDArray[np.bool_]:
+    """Vertices of the specimen, the cards left out: these carry hard edges at 1 mm above the tray and less."""
+    return np.asarray(scene.mesh.vertices[:, 2] > 1.0)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_each_pass_brings_the_surface_nearer_to_truth(seed: int) -> None:
+    scene = matched(seed)
+    of = tissue(scene)
+    medians, tails = [], []
+    for mesh in (scene.mesh, refined(scene, FIRST).mesh, refined(scene).mesh):
+        off = np.abs(scene.off_mm(mesh)[of])
+        assert np.isfinite(off).mean() > 0.98
+        medians.append(float(np.nanmedian(off)))
+        tails.append(float(np.nanpercentile(off, 90)))
+    start, one, two = medians
+    # Photos of 0.15 mm a pixel, correlated among nine of them: a third of a pixel is what such patches settle to.
+    assert one < 0.6 * start
+    assert two < one
+    assert 0.001 < two < scene.voxel_mm / 2
+    assert tails[2] <= tails[1] < tails[0]
+
+
+def test_vertices_that_are_not_worth_it_keep_their_places() -> None:
+    scene = matched(SEEDS[0])
+    worth = worth_refining(scene.mesh.vertices, scene.phantom.truth.marker_corners)
+    assert 0.2 < worth.mean() < 0.9
+    after = refined(scene, worth=worth)
+    assert np.array_equal(after.mesh.vertices[~worth], scene.mesh.vertices[~worth])
+    moved = np.linalg.norm(after.mesh.vertices - scene.mesh.vertices, axis=1)[worth]
+    assert (moved > 0).mean() > 0.95
+    assert not after.views[~worth].any()
+    assert np.isnan(after.unsettled_mm[~worth]).all()
+    assert np.array_equal(after.mesh.triangles, scene.mesh.triangles)
+    assert np.array_equal(after.mesh.colours, scene.mesh.colours)
+    # No pass may carry a vertex beyond what all of them together reach.
+    assert moved.max() <= sum(p.reach_voxels for p in SETTINGS.passes) * scene.voxel_mm * 1.001
+
+
+def test_what_is_not_worth_it_changes_nothing_far_from_it() -> None:
+    scene = matched(SEEDS[0])
+    some, every = refined(scene, worth=scene.worth), refined(scene)
+    inner = scene.mesh.vertices[:, 2] > 4.0
+    apart = np.linalg.norm(some.mesh.vertices - every.mesh.vertices, axis=1)[inner]
+    # Ten rounds of smoothing reach ten edges; well inside the specimen both ways are one.
+    assert np.percentile(apart, 99) < 0.01
+
+
+def test_views_and_what_is_left_unsettled_are_told() -> None:
+    scene = matched(SEEDS[0])
+    after = refined(scene, worth=scene.worth)
+    views = after.views[scene.worth]
+    assert views.max() == 9
+    assert views.max() <= len(scene.images)
+    assert (views >= 3).mean() > 0.9
+    unsettled = after.unsettled_mm[scene.worth]
+    assert np.isfinite(unsettled).all()
+    assert (unsettled >= 0).all()
+    # Within the last pass' reach, since its own best and its smoothed offset both are.
+    assert 1e-4 < np.median(unsettled) < SETTINGS.passes[-1].reach_voxels * scene.voxel_mm
+    assert unsettled.max() <= 2 * SETTINGS.passes[-1].reach_voxels * scene.voxel_mm
+
+
+def test_unsettled_places_are_the_worse_ones() -> None:
+    scene = matched(SEEDS[0])
+    after = refined(scene, worth=scene.worth)
+    of = tissue(scene)
+    off, unsettled = np.abs(scene.off_mm(after.mesh)[of]), after.unsettled_mm[of]
+    low, high = np.percentile(unsettled, [25, 75])
+    calm, restless = np.nanmedian(off[unsettled <= low]), np.nanmedian(off[unsettled >= high])
+    assert calm < restless
+
+
+def test_no_more_views_than_asked_for_are_compared() -> None:
+    scene = matched(SEEDS[0])
+    after = refined(scene, replace(SETTINGS, passes=(Pass(2.0, 7, 4),)), scene.worth)
+    assert after.views.max() == 4
+
+
+def test_nothing_worth_it_leaves_the_mesh_alone() -> None:
+    scene = matched(SEEDS[0])
+    after = refined(scene, worth=np.zeros(len(scene.mesh.vertices), bool))
+    assert after.mesh is scene.mesh
+    assert not after.views.any()
+    assert np.isnan(after.unsettled_mm).all()
+
+
+def test_blank_photos_leave_the_mesh_alone() -> None:
+    scene = matched(SEEDS[0])
+    blank = [np.full_like(g, 128) for g in scene.greys]
+    after = refine_mesh(scene.mesh, blank, scene.lens, scene.poses, scene.voxel_mm, FIRST, workers=2, worth=scene.worth)
+    assert np.array_equal(after.mesh.vertices, scene.mesh.vertices)
+
+
+def test_a_vertex_order_does_not_matter_beyond_last_bits() -> None:
+    scene = matched(SEEDS[0])
+    order = np.random.default_rng(0).permutation(len(scene.mesh.vertices))
+    place = np.argsort(order)
+    m = scene.mesh
+    mixed = Mesh(m.vertices[order], place[m.triangles].astype(np.int32), m.normals[order], m.colours[order])
+    again = refine_mesh(mixed, scene.greys, scene.lens, scene.poses, scene.voxel_mm, SETTINGS, workers=1)
+    apart = np.linalg.norm(again.mesh.vertices[place] - refined(scene).mesh.vertices, axis=1)
+    # Sums in another order differ in their last bits, and a second pass interpolates photos at places that differ.
+    assert np.median(apart) < 1e-3
+    assert np.percentile(apart, 99) < 0.01
+
+
+def test_progress_rises_to_one() -> None:
+    scene = matched(SEEDS[0])
+    heard: list[float] = []
+    refine_mesh(
+        scene.mesh, scene.greys, scene.lens, scene.poses, scene.voxel_mm, SETTINGS,
+        workers=2, worth=scene.worth, progress=heard.append,
+    )  # fmt: skip
+    assert len(heard) > 2 * len(SETTINGS.passes)
+    assert heard == sorted(heard)
+    assert heard[0] > 0
+    # A pass ends with its smoothing, which tells nothing.
+    assert 0.9 <= heard[-1] <= 1.0
+
+
+@pytest.mark.parametrize("after", [0, 3, 12])
+def test_a_stop_raised_by_progress_ends_the_work(after: int) -> None:
+    scene = matched(SEEDS[0])
+    heard: list[float] = []
+
+    def stop(share: float) -> None:
+        heard.append(share)
+        if len(heard) > after:
+            raise CancelledError("Stopped.", advice="Run again.")
+
+    with pytest.raises(CancelledError):
+        refine_mesh(
+            scene.mesh, scene.greys, scene.lens, scene.poses, scene.voxel_mm, SETTINGS,
+            workers=2, worth=scene.worth, progress=stop,
+        )  # fmt: skip
+    assert len(heard) == after + 1
