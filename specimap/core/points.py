@@ -97,6 +97,7 @@ def cloud_points(
         + card * np.uint8(Flag.MARKER_CARD)
         + (placement.incidence_deg > GRAZING_DEG) * np.uint8(Flag.GRAZING)
         + placement.occluded * np.uint8(Flag.OCCLUDED)
+        + placement.undercut * np.uint8(Flag.UNDERCUT)
         + (depth_sigma > INTERPOLATED_SIGMA_MM * UNSEEN_SIGMA_MM) * np.uint8(Flag.DEPTH_INTERPOLATED)
     ).astype(np.uint8)
     return CloudPoints(

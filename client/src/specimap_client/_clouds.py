@@ -153,7 +153,8 @@ class Cloud:
 
     @cached_property
     def flags(self) -> NDArray[np.uint8]:
-        """(S,) bits: 1 specimen, 2 marker card, 4 grazing, 8 saturated, 16 depth interpolated, 32 occluded."""
+        """(S,) bits: 1 specimen, 2 marker card, 4 grazing, 8 saturated, 16 depth interpolated, 32 occluded,
+        64 undercut."""
         return self._array("flags", np.uint8)
 
     def zarr(self) -> zarr.Group:

@@ -29,6 +29,9 @@ class Flag(IntFlag):
     """A good band of the raw spectrum is at the largest value it can have, or is not a finite number."""
     DEPTH_INTERPOLATED = 16
     OCCLUDED = 32
+    """Tissue stands between this place and the cube's camera: the spectrum is of the tissue in front (homography)."""
+    UNDERCUT = 64
+    """Other tissue stands above this place: top views and grids do not show it; the spectrum is its own (camera)."""
 
 
 @dataclass(frozen=True, eq=False)

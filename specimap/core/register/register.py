@@ -21,6 +21,8 @@ Method = Literal["camera", "homography"]
 GRAZING_DEG = 70.0
 STRIP_PIXELS = 1 << 16
 STRIP_WORKERS = 2
+CLEARANCE_MM = 0.15
+"""How far from a place a ray to whatever may hide it starts: about the surface's own error."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class Placement:
     ``pixels`` (S, 2) row and column of those that meet the surface; ``xyz`` (S, 3) mm; ``normal`` (S, 3) unit;
     ``rgb`` (S, 3); ``incidence_deg`` (S,) between normal and the direction to the camera; ``occluded`` (S,): the
     surface stands between this place and the cube's camera; ``triangle`` (S,) and ``barycentric`` (S, 2) on the
-    mesh (-1 where the place was looked up on a grid).
+    mesh (-1 where the place was looked up on a grid). ``undercut`` (S,): other surface stands above this place.
     """
 
     pixels: NDArray[np.uint16]
@@ -47,6 +49,7 @@ class Placement:
     rgb: NDArray[np.uint8]
     incidence_deg: NDArray[np.float32]
     occluded: NDArray[np.bool_]
+    undercut: NDArray[np.bool_]
     triangle: NDArray[np.int32]
     barycentric: NDArray[np.float32]
 
@@ -164,12 +167,29 @@ def _placed(
     away = view.cam_from_world.centre - xyz
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     cosine = np.clip((away * normal).sum(1), -1, 1)
-    occluded = np.zeros(len(xyz), bool)
+    occluded, undercut = np.zeros(len(xyz), bool), np.zeros(len(xyz), bool)
     if where is None:
-        # A place looked up from above can lie behind tissue for the cube's camera.
-        occluded = caster.cast(xyz + 0.5 * away, away).hit
+        occluded = _hidden_from(view, xyz, caster)
         where = np.full(len(xyz), -1, np.int32), np.zeros((len(xyz), 2), np.float32)
+    else:
+        up = np.broadcast_to([0.0, 0.0, 1.0], xyz.shape)
+        undercut = caster.cast(xyz.astype(float) + CLEARANCE_MM * up, up).hit
     return Placement(
         pixels.astype(np.uint16), xyz.astype(np.float32), normal.astype(np.float32), rgb,
-        np.degrees(np.arccos(cosine)).astype(np.float32), occluded, *where,
+        np.degrees(np.arccos(cosine)).astype(np.float32), occluded, undercut, *where,
     )  # fmt: skip
+
+
+def _hidden_from(view: View, xyz: NDArray[np.float32], caster: RayCaster) -> NDArray[np.bool_]:
+    """Whether tissue stands between the camera and places (S, 3) that were looked up from above.
+
+    Judged at the surface's own highest point over each place: the grid's cells smear their places across steps, and
+    what is hidden is often no wider than a cell.
+    """
+    above = xyz.astype(float)
+    above[:, 2] = float(caster.mesh.vertices[:, 2].max()) + 1.0
+    top = caster.cast(above, np.broadcast_to([0.0, 0.0, -1.0], above.shape))
+    place = np.where(top.hit[:, None], top.xyz, xyz).astype(float)
+    away = view.cam_from_world.centre - place
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    return caster.cast(place + CLEARANCE_MM * away, away).hit

@@ -1,0 +1,170 @@
+"""What is stated of a point's error: steps of the surface, the parts' sum, a mesh's standard deviation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matched_scene import matched
+from numpy.typing import NDArray
+
+from specimap.core.refine import Refined, RefineSettings, refine_mesh
+from specimap.core.uncertainty import (
+    AGREEMENT_MM,
+    LEAST_SIGMA_MM,
+    STEP_REACH_MM,
+    UNSEEN_SIGMA_MM,
+    mesh_sigma,
+    point_sigma,
+    step_height,
+    vertex_scatter,
+)
+
+Singles = NDArray[np.float32]
+SHAPE = (24, 30)
+SEED = 31
+
+
+def pixels_of(shape: tuple[int, int] = SHAPE) -> NDArray[np.uint16]:
+    return np.stack(np.indices(shape), -1).reshape(-1, 2).astype(np.uint16)
+
+
+def steps(z: Singles, pixel_mm: float) -> Singles:
+    """Steps of an image of heights."""
+    return step_height(pixels_of(z.shape), z.ravel(), pixel_mm).reshape(z.shape)  # type: ignore[arg-type]
+
+
+# ---- steps of the surface -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("pixel_mm", "half"), [(0.05, 3), (0.075, 2), (0.15, 1), (0.4, 1)])
+def test_a_plane_steps_by_its_slope_over_the_reach(pixel_mm: float, half: int) -> None:
+    assert half == max(1, round(STEP_REACH_MM / pixel_mm))
+    slope = 0.7
+    z = np.broadcast_to(slope * pixel_mm * np.arange(SHAPE[1]), SHAPE).astype(np.float32)
+    found = steps(z, pixel_mm)
+    inner = found[:, half:-half]
+    assert inner == pytest.approx(2 * half * slope * pixel_mm, rel=1e-4)
+    # At the border half the neighbourhood is missing, and nothing is made up for it.
+    assert found[:, 0] == pytest.approx(half * slope * pixel_mm, rel=1e-4)
+
+
+def test_a_level_plane_has_no_steps() -> None:
+    assert not steps(np.full(SHAPE, 7.5, np.float32), 0.1).any()
+
+
+def test_a_cliff_shows_within_the_reach_and_no_farther() -> None:
+    z = np.zeros(SHAPE, np.float32)
+    z[:, 15:] = -9.0
+    found = steps(z, 0.05)
+    assert (found[:, 12:18] == 9).all()
+    assert not found[:, :12].any()
+    assert not found[:, 18:].any()
+
+
+def test_pixels_without_a_point_make_no_step() -> None:
+    slope = 0.01
+    z = np.broadcast_to(slope * np.arange(SHAPE[1]), SHAPE).astype(np.float32)
+    kept = np.random.default_rng(3).random(SHAPE) < 0.4
+    kept[5, 5], kept[4:7, 4:7] = True, False
+    kept[5, 5] = True
+    pixels = pixels_of()[kept.ravel()]
+    found = step_height(pixels, z[kept], 1.0)
+    assert found.max() == pytest.approx(2 * slope, rel=1e-4)
+    alone = np.flatnonzero((pixels == 5).all(1))
+    assert found[alone] == pytest.approx(0.0)
+
+
+def test_the_order_of_pixels_and_the_level_do_not_matter() -> None:
+    rng = np.random.default_rng(4)
+    pixels, z = pixels_of(), rng.normal(0, 3, SHAPE[0] * SHAPE[1]).astype(np.float32)
+    order = rng.permutation(len(z))
+    found = step_height(pixels, z, 0.1)
+    assert np.array_equal(step_height(pixels[order], z[order], 0.1), found[order])
+    assert step_height(pixels, z + 64, 0.1) == pytest.approx(found, abs=1e-4)
+
+
+# ---- points -------------------------------------------------------------------------------------------
+
+
+def test_a_point_adds_its_parts_in_squares() -> None:
+    surface, step = np.array([0.03, 0.3], np.float32), np.zeros(2, np.float32)
+    assert point_sigma(surface, step, 0.0, 0.0) == pytest.approx(surface, rel=1e-6)
+    alone = [
+        point_sigma(np.zeros(2, np.float32), np.full(2, 0.5, np.float32), 0.0, 0.0),
+        point_sigma(surface, step, 0.0, 0.0),
+        point_sigma(np.zeros(2, np.float32), step, 0.04, 0.0),
+        point_sigma(np.zeros(2, np.float32), step, 0.0, 0.07),
+    ]
+    together = point_sigma(surface, np.full(2, 0.5, np.float32), 0.04, 0.07)
+    assert together == pytest.approx(np.sqrt(sum(a.astype(float) ** 2 for a in alone)), rel=1e-5)
+    assert all((a > 0).all() for a in alone)
+    assert together.dtype == np.float32
+
+
+@pytest.mark.parametrize("part", range(4))
+def test_no_part_makes_a_point_surer(part: int) -> None:
+    before: np.float32 | None = None
+    for value in np.linspace(0, 2, 9):
+        parts = [0.05, 0.3, 0.02, 0.01]
+        parts[part] = float(value)
+        surface, step = (np.array([p], np.float32) for p in parts[:2])
+        now = point_sigma(surface, step, parts[2], parts[3])[0]
+        assert before is None or now > before
+        before = now
+
+
+# ---- a mesh -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def after() -> Refined:
+    """The scene's mesh, refined as in the pipeline."""
+    m = matched(SEED)
+    return refine_mesh(m.mesh, m.greys, m.lens, m.poses, m.voxel_mm, RefineSettings(), workers=2, worth=m.worth)
+
+
+def test_stated_and_true_errors_of_a_mesh_go_together(after: Refined) -> None:
+    scene = matched(SEED)
+    sigma = mesh_sigma(after, scene.maps, scene.poses, workers=2)
+    assert sigma.dtype == np.float32
+    assert sigma.min() >= np.float32(LEAST_SIGMA_MM)
+    assert sigma.max() <= UNSEEN_SIGMA_MM
+    of = scene.mesh.vertices[:, 2] > 1.0
+    off, stated = np.abs(scene.off_mm(after.mesh)[of]), sigma[of]
+    low, high = np.percentile(stated, [25, 75])
+    assert np.nanmedian(off[stated <= low]) < np.nanmedian(off[stated >= high])
+
+
+def test_fewer_views_and_more_disagreement_make_a_mesh_less_sure(after: Refined) -> None:
+    scene = matched(SEED)
+    done = (after.views > 0) & np.isfinite(after.unsettled_mm)
+    plain = mesh_sigma(after, scene.maps, scene.poses)
+    fewer = replace(after, views=np.where(done, 3, 0).astype(np.uint8))
+    all_views = replace(after, views=np.where(done, 9, 0).astype(np.uint8))
+    assert (mesh_sigma(fewer, scene.maps, scene.poses) >= mesh_sigma(all_views, scene.maps, scene.poses)).all()
+    restless = replace(after, unsettled_mm=after.unsettled_mm + np.float32(0.1))
+    louder = mesh_sigma(restless, scene.maps, scene.poses)
+    assert (louder >= plain).all()
+    assert (louder[done] > plain[done]).mean() > 0.9
+
+
+def test_unrefined_vertices_keep_the_scatter_of_the_depths(after: Refined) -> None:
+    scene = matched(SEED)
+    idle = after.views == 0
+    assert idle.any()
+    scatter = vertex_scatter(after.mesh, scene.maps, scene.poses, workers=2)
+    assert mesh_sigma(after, scene.maps, scene.poses)[idle] == pytest.approx(scatter[idle], rel=1e-6)
+    # Depths scatter about what was fused of them by a part of a voxel, not by nothing.
+    assert 0.01 < np.median(scatter[idle]) < scene.voxel_mm
+
+
+def test_what_no_depth_map_sees_is_as_good_as_unknown(after: Refined) -> None:
+    scene = matched(SEED)
+    away = replace(after.mesh, vertices=(after.mesh.vertices + np.float32(3 * AGREEMENT_MM) * after.mesh.normals))
+    scatter = vertex_scatter(away, scene.maps[:1], scene.poses)
+    assert (scatter == UNSEEN_SIGMA_MM).mean() > 0.9
+    assert (vertex_scatter(after.mesh, (), scene.poses) == UNSEEN_SIGMA_MM).all()
+    blind = mesh_sigma(after, (), scene.poses)
+    assert (blind == UNSEEN_SIGMA_MM).all()
