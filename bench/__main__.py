@@ -1,4 +1,4 @@
-"""``python -m bench [--only sample|cube|photos|accuracy|features] [--repeats N]``."""
+"""``python -m bench [--only PART] [--repeats N]``."""
 
 from __future__ import annotations
 
@@ -12,15 +12,19 @@ from rich.console import Console
 from bench.accuracy import bench_accuracy
 from bench.cube import bench_cube
 from bench.features import bench_features
+from bench.growth import bench_growth
 from bench.machine import describe, in_words
 from bench.photos import bench_photos
 from bench.record import keep
 from bench.sample import bench_sample
+from bench.steps import bench_steps
 
 Part = Callable[[Console, Path, int], dict[str, object]]
 PARTS: dict[str, Part] = {
     "sample": bench_sample,
+    "steps": bench_steps,
     "cube": bench_cube,
+    "growth": bench_growth,
     "photos": bench_photos,
     "accuracy": bench_accuracy,
     "features": bench_features,

@@ -1,13 +1,21 @@
-"""The measured process. Says on standard output when a stage begins, and at the end what came out."""
+"""The measured process. Says on standard output when a stage begins, and at the end what came out.
+
+Photos and a cube: a whole run. ``--run`` and a cube: stages 3 and 4. Photos alone: stages 1 and 2.
+"""
 
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
 from argparse import ArgumentParser, Namespace
+from contextlib import nullcontext
+from dataclasses import asdict
 from pathlib import Path
 
+from bench.tracing import tracing
+from specimap.core.acquisition import photo_paths
 from specimap.core.cube import open_cube
 from specimap.core.pipeline import Inputs, Outputs, run_pipeline
 from specimap.core.pipeline.artefacts import load_stage1, load_stage2
@@ -15,7 +23,7 @@ from specimap.core.pipeline.clock import Clock
 from specimap.core.pipeline.finish import register_and_write
 from specimap.core.pipeline.outputs import prepare_folder
 from specimap.core.pipeline.settings import PipelineSettings, settings_from
-from specimap.core.pipeline.stages import render_stage
+from specimap.core.pipeline.stages import adjust_stage, reconstruct_stage, render_stage
 from specimap.core.raycast import RayCaster
 from specimap.core.report import Report
 
@@ -37,7 +45,8 @@ class _Steps:
         sys.stdout.flush()
 
 
-def _settings(options: Namespace) -> PipelineSettings:
+def settings_of(options: Namespace) -> PipelineSettings:
+    """The published settings, with the markers that the options name."""
     return settings_from(
         edge_mm=options.edge_mm, dictionary=options.dictionary, method=options.method, adjustment="rigid", r_pc=0.5,
         r_reg=2.0, backend="colmap", features="auto", working_px=1280,
@@ -55,41 +64,67 @@ def _said(report: Report) -> dict[str, object]:
     }
 
 
-def _run(options: Namespace, steps: _Steps) -> Report:
-    return run_pipeline(Inputs(options.photos, options.cube), options.out, _settings(options), progress=steps)
+def _run(options: Namespace, steps: _Steps) -> dict[str, object]:
+    report = run_pipeline(Inputs(options.photos, options.cube), options.out, settings_of(options), progress=steps)
+    return _said(report)
 
 
-def _register(options: Namespace, steps: _Steps) -> Report:
+def _surface(options: Namespace, steps: _Steps) -> dict[str, object]:
+    """Stages 1 and 2."""
+    prepare_folder(options.out)
+    settings, store, workers = settings_of(options), Outputs(options.out).store, os.cpu_count() or 1
+    clock = Clock(steps, lambda: False)
+    stage1 = reconstruct_stage(photo_paths(options.photos), settings, store, "bench", clock, workers)
+    stage2 = adjust_stage(stage1, settings, store, "bench", clock, workers)
+    used, given = len(stage1.reconstruction.photos), len(stage1.names) + len(stage1.refused)
+    return {"photos": [used, given], "vertices": len(stage2.mesh.vertices)}
+
+
+def _register(options: Namespace, steps: _Steps) -> dict[str, object]:
     """Stages 3 and 4 of a cube on the reconstruction that an earlier run left in ``options.run``."""
     store, keys = Outputs(options.run).store, {}
     for path in store.folder.glob("*.npz"):
         stage, _, keys[stage] = path.stem.partition("-")
-    stage1, stage2 = load_stage1(store, keys["reconstruct"]), load_stage2(store, keys["adjust"])
+    # Without depth maps, as in a worker's process for this stage; a run has let them go by then.
+    stage1 = load_stage1(store, keys["reconstruct"], with_depth=False)
+    stage2 = load_stage2(store, keys["adjust"])
     if stage1 is None or stage2 is None:
         raise RuntimeError(f"{options.run} holds no finished reconstruction")
     prepare_folder(options.out)
     clock = Clock(steps, lambda: False)
     # Opening the cube belongs to the stage; its hash is taken while stage 1 works, as a run does.
     cube = open_cube(options.cube)
-    settings, outputs, caster = _settings(options), Outputs(options.out), RayCaster(stage2.mesh)
+    settings, outputs, caster = settings_of(options), Outputs(options.out), RayCaster(stage2.mesh)
     grids = render_stage(stage2, caster, settings, outputs.store, "bench", clock)
-    return register_and_write(stage1, stage2, caster, grids, cube, settings, outputs, clock, [], {})
+    return _said(register_and_write(stage1, stage2, caster, grids, cube, settings, outputs, clock, [], {}))
 
 
-def main() -> None:
-    """Parse, run, say."""
+def parsed() -> Namespace:
+    """The command line."""
     parser = ArgumentParser()
     parser.add_argument("--edge-mm", type=float, default=6.8)
     parser.add_argument("--dictionary", default="DICT_4X4_50")
     parser.add_argument("--method", default="camera")
     parser.add_argument("--photos", type=Path)
     parser.add_argument("--run", type=Path)
-    parser.add_argument("--cube", type=Path, required=True)
+    parser.add_argument("--cube", type=Path)
     parser.add_argument("--out", type=Path, required=True)
-    options = parser.parse_args()
-    steps = _Steps()
-    report = _register(options, steps) if options.run else _run(options, steps)
-    steps.say(stage="end", result=_said(report))
+    parser.add_argument("--steps", action="store_true", help="time the steps too; stage `start` is then all imports")
+    return parser.parse_args()
+
+
+def main() -> None:
+    """Parse, run, say."""
+    options, steps = parsed(), _Steps()
+    work = _register if options.run else _run if options.cube else _surface
+    with tracing() if options.steps else nullcontext() as tracer:
+        if tracer is None:
+            result = work(options, steps)
+        else:
+            steps.say(stage="opening")
+            result = work(options, steps)
+            result["steps"] = {name: asdict(spent) for name, spent in tracer.steps.items()}
+    steps.say(stage="end", result=result)
 
 
 if __name__ == "__main__":

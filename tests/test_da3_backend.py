@@ -45,6 +45,11 @@ HOME = "SPECIMAP_DA3_HOME"
 SIZE_PX = 378
 
 
+@pytest.fixture(autouse=True)
+def _cache_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))  # large weights' sha256 is kept there
+
+
 @pytest.fixture
 def weights(tmp_path: Path) -> Path:
     """A file that passes for weights where nothing reads it."""

@@ -106,6 +106,8 @@ def test_the_whole_way_with_exact_predictions(tmp_path: Path, monkeypatch: pytes
     for name, value in ONE_THREAD.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setattr(backend, "CHILD", HERE / "mast3r_oracle.py")
+    # The oracle brings its own stand-in for torchvision.
+    monkeypatch.setattr("specimap.core.reconstruct.learned.required.check_backend", lambda name: None)
     out = tmp_path / "out"
     settings = PipelineSettings(reconstruct=ReconstructSettings(backend="mast3r"))
     report = run_pipeline(Inputs(disk.photos, disk.header), out, settings, workers=1)

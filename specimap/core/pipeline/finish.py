@@ -111,7 +111,7 @@ def _register(
     adjusted, (coarse, fine) = stage2.adjusted, grids
     found = find_markers(cube, settings.reconstruct.dictionary, adjusted.marker_ids)
     progress(0.1)
-    seen = _corners_in_cube(found, adjusted, cube.cols)
+    seen = corners_in_cube(found, adjusted, cube.cols)
     settled = settle_camera(seen, found, cube.rows, cube.cols, caster, adjusted.corners)
     camera, flat = settled.camera, seen.flat()
     homography = fit_homography(flat[0], flat[1], coarse, settings.register.ransac_px)
@@ -194,7 +194,8 @@ def _register(
     return points, report
 
 
-def _corners_in_cube(found: CubeMarkers, adjusted: Adjusted, cols: int) -> CornersInCube:
+def corners_in_cube(found: CubeMarkers, adjusted: Adjusted, cols: int) -> CornersInCube:
+    """The markers found in a cube of ``cols`` columns with their adjusted corners, columns as the camera saw them."""
     rows = [adjusted.marker_ids.index(i) for i in found.marker_ids]
     pixels = found.corners_px.copy()
     if found.mirrored:

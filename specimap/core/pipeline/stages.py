@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from specimap.core.acquisition import Photo, Refusal, read_photos, stated_focal_px
 from specimap.core.adjust import adjust
+from specimap.core.geometry import Floats, Intrinsics, Pose
 from specimap.core.native import preload
 from specimap.core.photosheet import contact_sheet
 from specimap.core.pipeline.artefacts import (
@@ -27,8 +30,9 @@ from specimap.core.points import worth_refining
 from specimap.core.raycast import RayCaster
 from specimap.core.reconstruct.backend import ReconstructionBackend, corners_in_photos, detect_in_photos
 from specimap.core.reconstruct.breathing import settle_breathing
-from specimap.core.reconstruct.depth import volume_over
-from specimap.core.refine import pixel_footprint_mm, refine_mesh
+from specimap.core.reconstruct.depth import DepthMap, volume_over
+from specimap.core.reconstruct.features import check_features
+from specimap.core.refine import Refined, pixel_footprint_mm, refine_mesh
 from specimap.core.render import Grid, extent_of, render_grid
 from specimap.core.surface import fuse
 from specimap.core.uncertainty import mesh_sigma
@@ -69,6 +73,8 @@ def reconstruct_stage(
         if found is not None:
             clock.reused.append("reconstruct")
             return found
+        check_features(settings.reconstruct.features)
+        backend = backend_named(settings.reconstruct.backend)
         preload()
         photos, refused = read_photos(
             paths, settings.acquisition, workers=workers, progress=lambda s: progress(0.08 * s)
@@ -80,7 +86,7 @@ def reconstruct_stage(
         photos, corners, zooms = settle_breathing(
             photos, corners, edge_mm=settings.adjust.edge_mm, focal_px=stated_focal_px(photos)
         )
-        reconstruction = backend_named(settings.reconstruct.backend).reconstruct(
+        reconstruction = backend.reconstruct(
             photos,
             corners,
             replace(settings.reconstruct, edge_mm=settings.adjust.edge_mm),
@@ -127,22 +133,37 @@ def adjust_stage(
         posed = replace(posed, photo=np.array([place[int(p)] for p in posed.photo]))
         adjusted = adjust(r.lens, r.poses, posed, stage1.corners.marker_ids, settings.adjust)
         maps = tuple(replace(m, depth=m.depth * np.float32(adjusted.scale)) for m in r.maps)
-        target = volume_over(adjusted.corners).centre
-        pixel_mm = pixel_footprint_mm(adjusted.lens, adjusted.poses, target)
-        shrinkage = settings.reconstruct.depth.shrinkage(adjusted.lens)
-        voxel_mm = settings.surface.voxel_mm or VOXEL_PIXELS * pixel_mm / shrinkage
-        fused = fuse(
-            list(maps), adjusted.poses, voxel_mm, settings.surface, progress=lambda s: progress(0.05 + 0.4 * s)
-        )
-        refined = refine_mesh(
-            fused, list(stage1.greys), adjusted.lens, adjusted.poses, voxel_mm, settings.refine,
-            workers=workers, worth=worth_refining(fused.vertices, adjusted.corners),
-            progress=lambda s: progress(0.45 + 0.5 * s),
+        refined = mesh_of(
+            maps, list(stage1.greys), adjusted.lens, adjusted.poses, adjusted.corners, settings,
+            workers=workers, progress=lambda s: progress(0.05 + 0.9 * s),
         )  # fmt: skip
         sigma = mesh_sigma(refined, maps, adjusted.poses, workers=workers)
         stage = Stage2(adjusted, refined.mesh, sigma.astype(float))
         save_stage2(store, key, stage)
         return stage
+
+
+def mesh_of(
+    maps: tuple[DepthMap, ...],
+    greys: list[NDArray[np.uint8]],
+    lens: Intrinsics,
+    poses: tuple[Pose, ...],
+    corners: Floats,
+    settings: PipelineSettings,
+    *,
+    workers: int,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Refined:
+    """Depth maps in mm to a mesh refined on the photos' ``greys``; all in the frame of ``poses`` and ``corners``."""
+    pixel_mm = pixel_footprint_mm(lens, poses, volume_over(corners).centre)
+    shrinkage = settings.reconstruct.depth.shrinkage(lens)
+    voxel_mm = settings.surface.voxel_mm or VOXEL_PIXELS * pixel_mm / shrinkage
+    fused = fuse(list(maps), poses, voxel_mm, settings.surface, progress=lambda s: progress(0.4 * s))
+    return refine_mesh(
+        fused, greys, lens, poses, voxel_mm, settings.refine,
+        workers=workers, worth=worth_refining(fused.vertices, corners),
+        progress=lambda s: progress(0.4 + 0.6 * s),
+    )  # fmt: skip
 
 
 def render_stage(
