@@ -58,7 +58,7 @@ def bench_steps(console: Console, work: Path, repeats: int) -> dict[str, object]
         given += ["--cube", str(case.cube)] if case.cube else []
         runs = [measure([*given, "--out", f"{out}_{k}", "--steps"]) for k in range(repeats)]
         best = min(runs, key=lambda m: m.whole.wall_s)
-        bounds = {START: imports["outside"]} | bounds_of([*given, "--out", f"{out}_0"])
+        bounds = {START: {"wall_s": imports["outside"]}} | bounds_of([*given, "--out", f"{out}_0"])
         figures["cases"][case.name] = {
             "steps": steps_of(best), "bounds": bounds, "runs": [m.as_dict() for m in runs],
         }  # fmt: skip
@@ -106,13 +106,13 @@ def imports_in(said: str) -> dict[str, float]:
     return {"all": every, "outside": outside}
 
 
-def bounds_of(given: list[str]) -> dict[str, float]:
+def bounds_of(given: list[str]) -> dict[str, dict[str, float]]:
     """Bounds by step, found in a process of their own. Raises RuntimeError with its message if that fails."""
     command = [sys.executable, "-m", "bench.step_bounds", *given]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
     if done.returncode:
         raise RuntimeError(f"bench.step_bounds {' '.join(given)} failed:\n{done.stderr}")
-    bounds: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    bounds: dict[str, dict[str, float]] = json.loads(done.stdout.splitlines()[-1])
     return bounds
 
 
@@ -123,21 +123,28 @@ def sheet_steps(figures: dict[str, Any]) -> list[Sheet]:
         whole = sum(step["wall_s"] for step in case["steps"].values())
         sheet = Sheet(
             f"Steps of a run, {name}, fastest of {figures['repeats']}",
-            ("step", "wall s", "share", "CPU s", "bound s", "bound / wall"),
+            ("step", "wall s", "share", "CPU s", "bound s", "of wall", "bound CPU s", "of CPU"),
         )
         for step, spent in case["steps"].items():
-            bound = case["bounds"].get(step)
-            beside = [NONE, NONE] if bound is None else [f"{bound:.2f}", f"{100 * bound / spent['wall_s']:.0f} %"]
+            bound = case["bounds"].get(step, {})
+            beside = [cell for key in ("wall_s", "cpu_s") for cell in _beside(bound.get(key), spent[key])]
             sheet.rows.append([
                 step, f"{spent['wall_s']:.2f}", f"{100 * spent['wall_s'] / whole:.1f} %",
                 NONE if step == END else f"{spent['cpu_s']:.2f}", *beside,
             ])  # fmt: skip
         cpu = sum(step["cpu_s"] for step in case["steps"].values())
-        sheet.rows.append(["whole", f"{whole:.2f}", "100 %", f"{cpu:.2f}", NONE, NONE])
+        sheet.rows.append(["whole", f"{whole:.2f}", "100 %", f"{cpu:.2f}", *[NONE] * 4])
         sheets.append(sheet)
     sheets[-1].notes += [
-        "CPU: of all threads while the step ran.",
+        "CPU: of all threads while the step ran. Where other work keeps the cores busy, walls of step and bound do not "
+        "compare; their CPU seconds do.",
         *(f"Bound of {step}: {what}." for step, what in BOUNDS.items()),
         f"All imports by `-X importtime`: {figures['imports']['all']:.2f} s.",
     ]
     return sheets
+
+
+def _beside(bound: float | None, spent: float) -> tuple[str, str]:
+    if bound is None:
+        return NONE, NONE
+    return f"{bound:.2f}", f"{100 * bound / spent:.0f} %" if spent > 0 else NONE

@@ -5,10 +5,12 @@ from __future__ import annotations
 import sys
 import threading
 import types
+from collections.abc import Callable
 from importlib.metadata import version
 
 import pytest
 
+from bench.__main__ import PARTS
 from bench.growth import (
     DISK_SHARE,
     FACTORS,
@@ -22,9 +24,12 @@ from bench.growth import (
 from bench.machine import OPTIONAL, available_bytes, describe, installed
 from bench.measure import Cost, Measured
 from bench.photos import COUNTS, sheet_photos
+from bench.step_bounds import BOUNDS, Recorded, Recorder, on_threads
 from bench.steps import END, ORDER, REST, START, imports_in, sheet_steps, steps_of
 from bench.synthetic import COLS, ROWS
+from bench.tables import OF_RUNS, ROOT, run_tables
 from bench.tracing import TARGETS, Spent, Target, owner_of, tracing
+from specimap.core.evidence.marks import check_marks
 
 
 class _Clock:
@@ -134,10 +139,40 @@ def test_steps_rest_and_ends_add_up_to_the_run() -> None:
     assert sum(s["wall_s"] for s in steps.values()) == pytest.approx(run.whole.wall_s)
     assert sum(s["cpu_s"] for s in steps.values()) == pytest.approx(run.whole.cpu_s)
     assert set(steps) < set(ORDER)
-    case = {"steps": steps, "bounds": {"fusion": 0.75}}
+    case = {"steps": steps, "bounds": {START: {"wall_s": 0.5}, "fusion": {"wall_s": 0.75, "cpu_s": 1.0}}}
     (sheet,) = sheet_steps({"repeats": 1, "imports": {"all": 1.0}, "cases": {"made up": case}})
-    assert ["fusion", "1.50", "20.0 %", "2.50", "0.75", "50 %"] in sheet.rows
+    assert sheet.rows[0] == [START, "1.00", "13.3 %", "0.90", "0.50", "50 %", "-", "-"]
+    assert ["fusion", "1.50", "20.0 %", "2.50", "0.75", "50 %", "1.00", "40 %"] in sheet.rows
     assert sheet.rows[-1][:4] == ["whole", "7.50", "100 %", "9.90"]
+
+
+def test_calls_are_made_as_before_and_can_be_made_again() -> None:
+    made: list[tuple[int, int]] = []
+
+    class Library:
+        name = "a library"
+
+        def compute(self, a: int, b: int) -> int:
+            made.append((a, b))
+            return a + b
+
+    calls: list[Callable[[], object]] = []
+    recorder = Recorder(Library(), "compute", calls)
+    assert recorder.name == "a library"
+    assert (recorder.compute(1, 2), recorder.compute(3, 4)) == (3, 7)
+    on_threads(calls)
+    assert made[:2] == [(1, 2), (3, 4)]
+    assert sorted(made[2:]) == [(1, 2), (3, 4)]
+    with pytest.raises(ZeroDivisionError):
+        on_threads([lambda: 1 // 0])
+
+
+def test_a_part_of_the_look_ups_is_scaled_by_their_samples() -> None:
+    assert Recorded(samples=[(100, True), (300, False), (200, False), (50, True)]).scale == pytest.approx(650 / 150)
+
+
+def test_every_bound_is_of_a_step() -> None:
+    assert set(BOUNDS) < set(ORDER)
 
 
 def test_imports_are_summed_by_whose_they_are() -> None:
@@ -201,3 +236,18 @@ def test_the_machine_names_optional_packages_only_where_they_are() -> None:
     assert isinstance(versions, dict)
     assert {name for name in OPTIONAL if name in versions} == set(installed(OPTIONAL))
     assert available_bytes() > 0
+
+
+def test_each_table_of_the_page_comes_from_a_part_and_has_its_place() -> None:
+    assert set(OF_RUNS) < set(PARTS)
+    for part in OF_RUNS:
+        assert f"<!-- {part} -->" in check_marks(ROOT / "docs" / "performance.md", part)
+
+
+def test_a_table_of_the_page_says_what_it_was_measured_on() -> None:
+    skipped = {"rows": 2, "cols": 4, "bytes": 3_000_000_000, "skipped": "no room"}
+    machine = {"cores": 3, "cpu": "a processor", "memory_gb": 5, "python": "3.11", "load_before": 0.5}
+    figures = {"repeats": 1, "sizes": {"4": skipped}, "load_after": 0.75}
+    said = run_tables("growth", {"figures": figures, "machine": machine, "time": "2026-01-02T03:04:05+00:00"})
+    assert "| 4 | 4 x 2 | 3.00 | - | - | - | - | - | - |" in said
+    assert said.endswith("3 x a processor, 5 GB, Python 3.11, load 0.5 before, 0.75 after; 2026-01-02.")

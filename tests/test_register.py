@@ -14,7 +14,7 @@ from specimap.core.errors import DuplicateMarkersError, MarkersMissingInCubeErro
 from specimap.core.fiducials import dictionary_named
 from specimap.core.geometry import Array, Floats, Intrinsics, View, look_at
 from specimap.core.raycast import RayCaster
-from specimap.core.register.camera import solve_camera
+from specimap.core.register.camera import FOCAL_PRIOR_SD, solve_camera
 from specimap.core.register.cube_markers import find_markers, stretched
 from specimap.core.register.register import fit_homography, place_by_camera, place_by_homography
 from specimap.core.render import render_grid
@@ -52,7 +52,7 @@ def test_the_camera_is_solved_without_calibration(lift_mm: float, seed: int) -> 
     assert 0.005 < camera.rms_px < 0.06
     assert camera.view.cam_from_world.centre[2] > 0
     assert 1e-6 < abs(np.log(camera.view.intrinsics.focal_px / 1000)) < 0.6
-    assert 0.001 < camera.focal_sd < 0.7
+    assert 0.001 < camera.focal_sd < FOCAL_PRIOR_SD
 
 
 def errors_on_surface(xyz: Floats, pixels: Array) -> Floats:

@@ -46,9 +46,9 @@ def test_a_plane_steps_by_its_slope_over_the_reach(pixel_mm: float, half: int) -
     z = np.broadcast_to(slope * pixel_mm * np.arange(SHAPE[1]), SHAPE).astype(np.float32)
     found = steps(z, pixel_mm)
     inner = found[:, half:-half]
-    assert inner == pytest.approx(2 * half * slope * pixel_mm, rel=1e-4)
+    assert inner == pytest.approx(2 * STEP_REACH_MM * slope, rel=1e-4)
     # At the border half the neighbourhood is missing, and nothing is made up for it.
-    assert found[:, 0] == pytest.approx(half * slope * pixel_mm, rel=1e-4)
+    assert found[:, 0] == pytest.approx(STEP_REACH_MM * slope, rel=1e-4)
 
 
 def test_a_level_plane_has_no_steps() -> None:
@@ -58,8 +58,8 @@ def test_a_level_plane_has_no_steps() -> None:
 def test_a_cliff_shows_within_the_reach_and_no_farther() -> None:
     z = np.zeros(SHAPE, np.float32)
     z[:, 15:] = -9.0
-    found = steps(z, 0.05)
-    assert (found[:, 12:18] == 9).all()
+    found = steps(z, STEP_REACH_MM / 3)
+    assert found[:, 12:18] == pytest.approx(9.0)
     assert not found[:, :12].any()
     assert not found[:, 18:].any()
 
@@ -72,7 +72,7 @@ def test_pixels_without_a_point_make_no_step() -> None:
     kept[5, 5] = True
     pixels = pixels_of()[kept.ravel()]
     found = step_height(pixels, z[kept], 1.0)
-    assert found.max() == pytest.approx(2 * slope, rel=1e-4)
+    assert found.max() == pytest.approx(2 * STEP_REACH_MM * slope, rel=1e-4)
     alone = np.flatnonzero((pixels == 5).all(1))
     assert found[alone] == pytest.approx(0.0)
 

@@ -98,6 +98,7 @@ def refine_mesh(
             refined, chosen, greys, lens, poses, voxel_mm, settings, one, workers,
             lambda s, done=done, share=share: progress(done + share * s),  # type: ignore[misc]
         )  # fmt: skip
+    progress(1.0)
     return refined
 
 

@@ -88,7 +88,20 @@ def fuse(
     vertices, triangles, colours = _largest_parts(
         vertices, triangles, colours, settings.smallest_part_share
     )
+    vertices, triangles, colours = _in_order(vertices, triangles, colours)
     return Mesh(vertices, triangles, vertex_normals(vertices, triangles), colours)
+
+
+def _in_order(
+    vertices: NDArray[np.float32], triangles: NDArray[np.int32], colours: NDArray[np.uint8]
+) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.uint8]]:
+    """Vertices by place, triangles by vertices: threads leave the order open, and sums follow it in their last bits."""
+    order = np.lexsort(vertices.T)
+    new_index = np.empty(len(order), np.int32)
+    new_index[order] = np.arange(len(order), dtype=np.int32)
+    turned = new_index[triangles]
+    turned = np.take_along_axis(turned, (turned.argmin(1)[:, None] + np.arange(3)) % 3, 1)
+    return vertices[order], turned[np.lexsort(turned.T[::-1])], colours[order]
 
 
 def _largest_parts(

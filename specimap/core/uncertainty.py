@@ -36,9 +36,9 @@ OF_SCATTER = 0.545
 MOST_VIEWS = 9
 OF_UNSETTLED = 2.0
 """How much farther off a vertex is than its photos and its neighbours disagree by."""
-OF_STEP = 0.14
+OF_STEP = 0.12
 """Share of the surface's step within a cube pixel's reach that a sideways error turns into height."""
-STEP_REACH_MM = 0.15
+STEP_REACH_MM = 0.17
 
 
 def mesh_sigma(
@@ -109,10 +109,11 @@ def step_height(
 ) -> NDArray[np.float32]:
     """Range (S,) of the heights ``z`` (S,) mm around each of the cube's ``pixels`` (S, 2) row, column.
 
-    Within ``STEP_REACH_MM`` of it, and at least to the next pixel: large on flanks and across edges behind which
-    the surface lies lower.
+    Within ``STEP_REACH_MM`` of it, taken from whole pixels in proportion: large on flanks and across edges behind
+    which the surface lies lower.
     """
     half = max(1, round(STEP_REACH_MM / pixel_mm))
+    share = np.float32(STEP_REACH_MM / (half * pixel_mm))
     reach = np.ones((2 * half + 1, 2 * half + 1), np.uint8)
     shape = tuple(int(n) for n in pixels.max(0) + np.uint16(1))
     far = np.float32(1e6)
@@ -122,7 +123,7 @@ def step_height(
     high = cv2.dilate(grid, reach)[rows, cols]
     grid[grid == -far] = far
     low = cv2.erode(grid, reach)[rows, cols]
-    return np.asarray(high - low, np.float32)
+    return np.asarray(share * (high - low), np.float32)
 
 
 def point_sigma(

@@ -20,6 +20,7 @@ from specimap.core.cloud.schema import ARRAYS
 from specimap.core.errors import CancelledError, NotFoundError, SpecimapError
 from specimap.core.export.formats import FileFormat, file_name
 from specimap.core.files import disk_errors, remove
+from specimap.core.reconstruct.learned.environment import bare_environment
 from specimap.infra.database import Database
 from specimap.infra.errors import DatabaseUnavailableError, StageTimeoutError, WorkerCrashedError
 from specimap.infra.labels import current_labels, fingerprint
@@ -28,7 +29,6 @@ from specimap.infra.models import CloudRow, Export
 from specimap.infra.settings import ServiceSettings
 from specimap.infra.storage import Storage
 from specimap.workers.export_main import REFUSED
-from specimap.workers.processes import bare_environment
 
 DOCUMENTS = (FileFormat.HTML, FileFormat.PDF)
 POLL_SECONDS = 0.1

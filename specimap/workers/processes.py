@@ -13,8 +13,7 @@ from contextlib import suppress
 from typing import Any
 
 from specimap.core.errors import SpecimapError
-from specimap.core.reconstruct.learned.environment import BACKEND_VARIABLES
-from specimap.core.reconstruct.learned.environment import bare_environment as bare_environment
+from specimap.core.reconstruct.learned.environment import BACKEND_VARIABLES, bare_environment
 from specimap.infra.errors import StageTimeoutError
 
 COMMAND = (sys.executable, "-m", "specimap.workers.stage_main")

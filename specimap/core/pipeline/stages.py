@@ -31,7 +31,7 @@ from specimap.core.raycast import RayCaster
 from specimap.core.reconstruct.backend import ReconstructionBackend, corners_in_photos, detect_in_photos
 from specimap.core.reconstruct.breathing import settle_breathing
 from specimap.core.reconstruct.depth import DepthMap, volume_over
-from specimap.core.reconstruct.features import check_features
+from specimap.core.reconstruct.learned.required import check_required
 from specimap.core.refine import Refined, pixel_footprint_mm, refine_mesh
 from specimap.core.render import Grid, extent_of, render_grid
 from specimap.core.surface import fuse
@@ -73,7 +73,7 @@ def reconstruct_stage(
         if found is not None:
             clock.reused.append("reconstruct")
             return found
-        check_features(settings.reconstruct.features)
+        check_required(settings.reconstruct)
         backend = backend_named(settings.reconstruct.backend)
         preload()
         photos, refused = read_photos(
@@ -104,7 +104,8 @@ def reconstruct_stage(
             contact_sheet([photos[p].image for p in reconstruction.photos]),
         )  # fmt: skip
         save_stage1(store, key, stage)
-        return stage
+        # As stored: depth is rounded there, and a run that goes on later must come out the same.
+        return load_stage1(store, key, with_depth=True) or stage
 
 
 def _subject_mm(photos: list[Photo]) -> float | None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from specimap.core.acquisition import Photo
 from specimap.core.errors import SpecimapError
+from specimap.core.fiducials import linear_from_srgb
 from specimap.core.geometry import Floats, Intrinsics, Pose, rotation_from_vector, skew
 from specimap.core.reconstruct.backend import CornersInPhotos
 from specimap.core.reconstruct.markers import solve_from_markers
@@ -36,7 +37,7 @@ SETTLING = 3
 
 @dataclass(frozen=True)
 class Breathing:
-    """``zooms`` (P,): focal length of each photo over the shared one, 1 on average; ``sd`` (P,) of their logarithms;
+    """``zooms`` (P,): focal length of each photo over the shared one, 1 in the middle; ``sd`` (P,) of their logarithms;
     ``significance``: mean square of the logarithms over their variances, about 1 where nothing breathes."""
 
     zooms: Floats
@@ -152,6 +153,10 @@ def image_at_shared(image: NDArray[np.uint8], zoom: float) -> NDArray[np.uint8]:
     x, y = (1 - zoom) * (width - 1) / 2, (1 - zoom) * (height - 1) / 2
     from_shared = np.array([[zoom, 0, x], [0, zoom, y]])
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-    return np.asarray(
-        cv2.warpAffine(image, from_shared, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    # In linear light: interpolated as encoded, an edge moves toward its dark side by a tenth of a pixel.
+    light = cv2.warpAffine(
+        linear_from_srgb(image), from_shared, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
     )
+    light = np.clip(light, 0, 1)
+    encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return np.asarray(255 * encoded + 0.5, np.uint8)

@@ -98,7 +98,11 @@ def solve_camera(
             advice="Check that cube and photos show the same, unmoved markers.",
         )
     lens = Intrinsics.centred(cols, rows, best[2])
-    return _refine(corners, corners_px, sigma_px, lens, best[1], focal_px is None, anchor)
+    first = _refine(corners, corners_px, sigma_px, lens, best[1], focal_px is None, anchor).view
+    # Once more from there: steps and covariance are then about the camera that is given.
+    return _refine(
+        corners, corners_px, sigma_px, first.intrinsics, first.cam_from_world, focal_px is None, anchor
+    )
 
 
 def _refine(

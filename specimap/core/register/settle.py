@@ -19,7 +19,7 @@ from specimap.core.register.camera import Anchor, CubeCamera, solve_camera
 from specimap.core.register.cube_markers import CubeMarkers
 from specimap.core.register.motion import LEAST_MARKERS, SHARED_MM, Shift, specimen_shift
 
-LOOSE_MM = 0.15
+LOOSE_MM = 0.1
 """Sideways standard deviation at the specimen from which on the markers' word is not enough."""
 EXPLAINED_BY_CAMERA = 3.0
 """A shift within so many standard deviations of the camera is the camera's, not the specimen's."""
