@@ -10,6 +10,7 @@ from pathlib import Path
 from rich.console import Console
 
 from bench.accuracy import bench_accuracy
+from bench.budget import bench_budget
 from bench.cube import bench_cube
 from bench.features import bench_features
 from bench.growth import bench_growth
@@ -27,6 +28,7 @@ PARTS: dict[str, Part] = {
     "growth": bench_growth,
     "photos": bench_photos,
     "accuracy": bench_accuracy,
+    "budget": bench_budget,
     "features": bench_features,
 }
 

@@ -75,6 +75,15 @@ def long_table(figures: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
+def budget_table(figures: dict[str, Any]) -> str:
+    """For docs/accuracy.md: what each part leaves when it is replaced by truth."""
+    names = list(figures)
+    rows = [f"| what is true | {' | '.join(f'{n}: median, p95 mm' for n in names)} |", "|---|" + "---|" * len(names)]
+    for parts in zip(*figures.values(), strict=True):
+        rows.append(f"| {parts[0][0]} | {' | '.join(f'{median:.3f}, {p95:.3f}' for _, median, p95 in parts)} |")
+    return "\n".join(rows)
+
+
 def real_line(real: dict[str, Any]) -> str:
     """The printed board in one sentence."""
     (used, given), (mean, std) = real["photos"], real["edge_mm"]
@@ -99,6 +108,7 @@ def main() -> None:
     put(ROOT / "docs" / "accuracy.md", "accuracy", long_table(figures))
     if REAL in figures:
         put(ROOT / "docs" / "accuracy.md", "apple", real_line(figures[REAL]))
+    put(ROOT / "docs" / "accuracy.md", "budget", budget_table(newest("budget")))
     for part in OF_RUNS:
         put(ROOT / "docs" / "performance.md", part, run_tables(part, newest_record(part)))
     for part in PARTS:

@@ -26,7 +26,7 @@ METRES = 1e-3
 SURE = 10.0
 
 
-class Oracle(torch.nn.Module):
+class Oracle(torch.nn.Module):  # type: ignore[misc]
     """Answers as upstream's network does, from an archive."""
 
     def __init__(self, path: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,9 @@ from specimap.core.fiducials import Detection, detect_markers, fitting_dictionar
 from specimap.core.geometry import Intrinsics, Pose
 from specimap.core.reconstruct.depth import DepthMap, DepthSettings
 from specimap.core.solver import Observations
+
+if TYPE_CHECKING:
+    from specimap.core.reconstruct.markers import MarkerSolution
 
 CORNER_FLOOR_PX = 0.05
 """Least standard deviation of a corner: what neighbouring profiles share does not show in their scatter."""
@@ -45,10 +48,11 @@ class ReconstructSettings:
 @dataclass(frozen=True)
 class CornersInPhotos:
     """All markers in all photos: ``seen.photo`` indexes the photos, ``seen.marker`` indexes ``marker_ids``
-    (ascending)."""
+    (ascending). ``solution``: what they were solved to, where that was done already."""
 
     seen: Observations
     marker_ids: tuple[int, ...]
+    solution: MarkerSolution | None = None
 
 
 @dataclass(frozen=True)

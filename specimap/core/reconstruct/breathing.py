@@ -68,13 +68,14 @@ def settle_breathing(
             break
         found = estimate_breathing(solution.scene, solution.seen)
         if found is None or (turn == 0 and found.significance < SIGNIFICANT):
+            corners = replace(corners, solution=solution)
             break
         zooms[list(solution.photos)] *= found.zooms
         seen = bring_to_shared(corners.seen, zooms, photos[0].size)
     if (zooms == 1).all():
         return photos, corners, zooms
     steady = [replace(p, image=image_at_shared(p.image, float(z))) for p, z in zip(photos, zooms, strict=True)]
-    return steady, replace(corners, seen=seen), zooms
+    return steady, replace(corners, seen=seen, solution=None), zooms
 
 
 def estimate_breathing(scene: MarkerScene, seen: Observations) -> Breathing | None:

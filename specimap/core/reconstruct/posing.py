@@ -57,7 +57,7 @@ def pose_photos(
     check_features(settings.features)
     progress(0.0)
     focal = stated_focal_px(photos)
-    solution = solve_from_markers(
+    solution = corners.solution or solve_from_markers(
         corners.seen, corners.marker_ids, photos[0].size, edge_mm=settings.edge_mm, focal_px=focal
     )
     progress(SOLVED)
