@@ -224,7 +224,8 @@ def test_the_middle_stays_and_a_zoom_too_small_to_see_moves_nothing() -> None:
 
 def unchanged(photos: list[Photo], corners: CornersInPhotos) -> bool:
     after, brought, zooms = settle_breathing(photos, corners, edge_mm=EDGE_MM, focal_px=None)
-    return after is photos and brought.seen is corners.seen and zooms.shape == (len(photos),) and bool((zooms == 1).all())
+    same = after is photos and brought.seen is corners.seen and zooms.shape == (len(photos),)
+    return same and bool((zooms == 1).all())
 
 
 def test_two_photos_tell_nothing() -> None:
