@@ -18,7 +18,7 @@ from specimap.core.reconstruct.features import FeatureKind, Features, aliked_mis
 from specimap.core.reconstruct.locating import Locator
 
 needs_aliked = pytest.mark.skipif(
-    bool(aliked_missing()), reason="the packages of specimap[learned] are not installed"
+    bool(aliked_missing()), reason="the packages of make learned are not installed"
 )
 TARGET = np.array([0.0, 0.0, 3.0])
 PHOTO = 5
@@ -119,7 +119,7 @@ def test_missing_weights_are_refused_not_fetched(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(module, "WEIGHTS", ("absent.pth",))
     with pytest.raises(BackendUnavailableError, match=r"absent\.pth") as refused:
         module._networks.__wrapped__()
-    assert "specimap[learned]" in refused.value.advice
+    assert "make learned" in refused.value.advice
 
 
 def test_torch_stays_out_unless_aliked_is_asked_for() -> None:

@@ -113,7 +113,7 @@ def test_aliked_that_is_absent_is_refused_first(scene: Ring, monkeypatch: pytest
     with pytest.raises(BackendUnavailableError) as refused:
         pose_photos(scene.photos, scene.corners, ReconstructSettings(features="aliked"), progress=heard.append)
     assert refused.value.details["missing"] == ["torch", "kornia"]
-    assert "specimap[learned]" in refused.value.advice
+    assert "make learned" in refused.value.advice
     assert heard == []
 
 

@@ -42,7 +42,7 @@ def test_job_is_queued_with_its_workflow_and_first_event(any_service: Running) -
     assert answer.headers["location"] == f"/v1/jobs/{job['id']}"
     assert client.get(answer.headers["location"]).json() == job
     assert job["settings"] == {
-        "method": "camera", "adjustment": "rigid", "r_pc": 0.25, "r_reg": 2.0, "backend": "colmap",
+        "method": "camera", "adjustment": "rigid", "r_pc": 0.25, "r_reg": 2.0, "backend": "colmap", "features": "auto",
         "working_px": 1280, "dictionary": "DICT_4X4_50", "edge_mm": 7.5,
     }  # fmt: skip
     expected: dict[str, Any] = {
@@ -118,7 +118,7 @@ def test_idempotency_key_belongs_to_one_request_of_one_key(service: Running) -> 
         ({"settings": {"r_reg": 1e9}}, "body.settings.r_reg"),
         ({"settings": {"working_px": 10}}, "body.settings.working_px"),
         ({"settings": {"method": "magic"}}, "body.settings.method"),
-        ({"settings": {"backend": "mast3r"}}, "body.settings.backend"),
+        ({"settings": {"backend": "nerf"}}, "body.settings.backend"),
         ({"settings": {"dictionary": "DICT_9X9"}}, "body.settings.dictionary"),
         ({"settings": {"edge_mm": -1}}, "body.settings.edge_mm"),
         ({"settings": {"r_px": 1}}, "body.settings.r_px"),
