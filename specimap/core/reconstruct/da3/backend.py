@@ -107,6 +107,7 @@ class Da3Backend:
                             f"{'pinned' if weights.pinned else 'not pinned'}: {weights.sha256}."),
             *_unaligned(shown, metric),
         )  # fmt: skip
+        progress(1.0)
         return Reconstruction(
             posed.photos, posed.lens, posed.poses, tuple(maps), sparse_points(maps, posed.poses),
             posed.refused, (*posed.remarks, *remarks),

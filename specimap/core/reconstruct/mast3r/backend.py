@@ -101,6 +101,7 @@ class Mast3rBackend:
         seen_lens = network_lens(metric.lens, plan)
         maps = depth_maps(predicted, used, metric, seen_lens, images, chosen.confidence)
         without = [photos[p].name for p in used if metric.fits[p] is None]
+        progress(1.0)
         return Reconstruction(
             used, metric.lens, kept, maps, sparse_points(list(maps), kept), refused,
             (LICENCE, told(answer, weights), *unaligned(without, len(used))),
