@@ -14,9 +14,10 @@ from specimap.core.errors import CubeNotFoundError, NotFoundError, SettingsError
 from specimap.core.evidence import published
 from specimap.core.evidence.capture import find_capture
 from specimap.core.evidence.marks import check_marks, put
-from specimap.core.evidence.runs import STAGE_SHARES, figures_of, within
+from specimap.core.evidence.runs import STAGE_SHARES, figures_of
 from specimap.core.evidence.tables import Table
 from specimap.core.evidence.truth import evenly, judge, judge_with_sigma, some
+from specimap.core.progress import within
 
 # ---- acquisitions -------------------------------------------------------------------------------------
 

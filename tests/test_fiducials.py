@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from specimap.core.acquisition import AcquisitionSettings, Photo, read_photo
+from specimap.core.colour import linear_from_srgb, srgb_from_linear
 from specimap.core.errors import (
     DuplicateMarkersError,
     NoMarkersFoundError,
@@ -20,10 +21,8 @@ from specimap.core.fiducials import (
     detect_markers,
     dictionary_named,
     fitting_dictionaries,
-    linear_from_srgb,
 )
 from specimap.core.geometry import Floats
-from specimap.core.phantom.render import srgb_from_linear
 from specimap.core.reconstruct.backend import corners_in_photos
 
 Bytes = NDArray[np.uint8]

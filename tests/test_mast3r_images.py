@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from specimap.core.errors import DepthNotFoundError, PhotosNotConnectedError, SettingsError
 from specimap.core.geometry import Floats
-from specimap.core.reconstruct.mast3r.child import STEPS, bars, require_finite, typed_failures
+from specimap.core.reconstruct.mast3r.child import STEPS, TypedFailures, bars, require_finite
 from specimap.core.reconstruct.mast3r.images import plan_preparation
 from specimap.core.reconstruct.mast3r.metric import network_lens
 from specimap.core.reconstruct.mast3r.settings import VARIABLES, Mast3rSettings, settings_from_environment
@@ -145,7 +145,7 @@ def prepare(img: str, then: Callable[[float], None]) -> None:
 
 
 def test_upstreams_assertion_on_depth_names_the_photo() -> None:
-    with pytest.raises(DepthNotFoundError, match=r"b\.jpg a depth that is not positive") as caught, typed_failures(
+    with pytest.raises(DepthNotFoundError, match=r"b\.jpg a depth that is not positive") as caught, TypedFailures(
         ["a.jpg", "b.jpg"]
     ):
         prepare("1", anchor_depth_offsets)
@@ -154,14 +154,14 @@ def test_upstreams_assertion_on_depth_names_the_photo() -> None:
 
 @pytest.mark.parametrize("edges", [0, -1])
 def test_upstreams_failures_to_connect(edges: int) -> None:
-    with pytest.raises(PhotosNotConnectedError, match="cannot align"), typed_failures(["a.jpg"]):
+    with pytest.raises(PhotosNotConnectedError, match="cannot align"), TypedFailures(["a.jpg"]):
         sparse_scene_optimizer(edges)
 
 
 def test_other_failures_stay_what_they_are() -> None:
-    with pytest.raises(AssertionError), typed_failures(["a.jpg"]):
+    with pytest.raises(AssertionError), TypedFailures(["a.jpg"]):
         prepare("", anchor_depth_offsets)
-    with pytest.raises(ZeroDivisionError), typed_failures([]):
+    with pytest.raises(ZeroDivisionError), TypedFailures([]):
         _ = 1 / 0
 
 

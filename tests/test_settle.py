@@ -194,7 +194,10 @@ def test_a_moved_specimen_does_not_draw_the_camera_along(caster: RayCaster, seed
         found = case(image, caster, ALL, noise_px, seed)
         assert not found.settled.by_specimen
         assert found.after_mm == found.before_mm
-        assert [code for code, _ in found.settled.remarks()] == ["specimen_moved", "cube_camera_loose"]
+        # A motion is no fault of the camera's.
+        loose = ["cube_camera_loose"] if found.settled.camera_mm > LOOSE_MM else []
+        assert [code for code, _ in found.settled.remarks()] == ["specimen_moved", *loose]
+        assert noise_px > SHARP_PX or not loose
         # What the camera itself is off by is part of what is seen of the motion.
         assert found.settled.sideways_mm == pytest.approx(moved, abs=found.before_mm + SHARED_MM)
 

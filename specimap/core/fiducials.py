@@ -10,14 +10,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap.core.colour import linear_from_srgb
 from specimap.core.errors import UnknownDictionaryError
 from specimap.core.geometry import Array, Floats
+from specimap.core.robust import SIGMA_OF_MAD
 
 Bytes = NDArray[np.uint8]
 
@@ -48,17 +49,6 @@ class Detection:
     def edge_px(self) -> float:
         """Mean length of the four edges in pixels."""
         return float(np.linalg.norm(self.corners_px - np.roll(self.corners_px, -1, 0), axis=1).mean())
-
-
-@cache
-def _linear_from_srgb() -> NDArray[np.float32]:
-    v = np.arange(256) / 255
-    return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def linear_from_srgb(image: Bytes) -> NDArray[np.float32]:
-    """sRGB bytes to linear light in 0..1, same shape (IEC 61966-2-1)."""
-    return np.asarray(_linear_from_srgb()[image])
 
 
 def dictionary_named(name: str) -> cv2.aruco.Dictionary:
@@ -207,7 +197,7 @@ def _fit_edge(
     for _ in range(4):
         slope_fit, offset = np.polyfit(u[keep], v[keep], 1)
         residual = np.abs(v - (slope_fit * u + offset))
-        keep = residual <= max(0.08, 2.5 * 1.4826 * float(np.median(residual[keep])))
+        keep = residual <= max(0.08, 2.5 * SIGMA_OF_MAD * float(np.median(residual[keep])))
         if keep.sum() < PROFILES_PER_EDGE // 3:
             return fallback
     p0 = a + normal * offset

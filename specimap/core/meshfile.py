@@ -11,6 +11,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap.core.colour import linear_from_srgb
 from specimap.core.errors import CloudDamagedError, SettingsError
 from specimap.core.files import atomic_path
 from specimap.core.geometry import Array
@@ -160,9 +161,7 @@ MESH_WRITERS: dict[str, Callable[[BinaryIO, Mesh], None]] = {"stl": _write_stl, 
 
 def _linear_colours(colours: NDArray[np.uint8]) -> NDArray[np.uint16]:
     """sRGB as linear light in 16 bits: glTF's vertex colours are linear, and 8 bits would lose the dark ones."""
-    s = np.arange(256) / 255
-    linear = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
-    return np.asarray(np.rint(linear * 65535).astype(np.uint16)[colours])
+    return np.asarray(np.rint(linear_from_srgb(colours) * 65535), np.uint16)
 
 
 def _lines(line: str, table: Array) -> bytes:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
 from specimap.core.geometry import Floats, Intrinsics, Pose
+from specimap.core.progress import within
 from specimap.core.raycast import RayCaster
 from specimap.core.surface import Mesh, vertex_normals
 
@@ -96,7 +97,7 @@ def refine_mesh(
         done, share = sum(cost[:k]) / sum(cost), cost[k] / sum(cost)
         refined = _refined_once(
             refined, chosen, greys, lens, poses, voxel_mm, settings, one, workers,
-            lambda s, done=done, share=share: progress(done + share * s),  # type: ignore[misc]
+            within(progress, done, done + share),
         )  # fmt: skip
     progress(1.0)
     return refined

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specimap.core.geometry import Floats, Intrinsics, Pose, rotation_from_vector, skew
+from specimap.core.robust import MEDIAN_OF_RAYLEIGH
 
 Ints = NDArray[np.int64]
 
@@ -29,8 +30,6 @@ HUBER = 2.5
 """Residuals beyond this many standard deviations lose weight."""
 NOISE_ROUNDS = 3
 """How often the scatter of the corners is estimated anew; large at first, so that a rough start is forgiven."""
-MEDIAN_OF_RAYLEIGH = 1.1774
-"""Median length of a 2D normal vector of unit standard deviation."""
 
 
 @dataclass(frozen=True)

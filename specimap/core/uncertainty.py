@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from specimap.core.geometry import Pose
 from specimap.core.reconstruct.depth import DepthMap
 from specimap.core.refine import Refined
+from specimap.core.robust import SIGMA_OF_MAD
 from specimap.core.surface import Mesh
 
-SIGMA_OF_MAD = 1.4826
 AGREEMENT_MM = 1.5
 """Depths farther from the mesh than this see another surface (an occluder), not this one badly."""
 SHARED_ERROR = 0.5
@@ -54,8 +54,8 @@ def mesh_sigma(
     fewer = np.sqrt(MOST_VIEWS / np.maximum(refined.views[done], 1))
     sigma = scatter.copy()
     sigma[done] = np.hypot(OF_SCATTER * typical * fewer, OF_UNSETTLED * refined.unsettled_mm[done])
-    # Where no depth map saw the place, photos alone found it, or nothing did.
-    sigma[done & ~measured] = np.maximum(sigma[done & ~measured], UNSEEN_SIGMA_MM)
+    # No depth map saw the place: what the photos agree on there may be anything.
+    sigma[done & ~measured] = UNSEEN_SIGMA_MM
     return np.clip(sigma, LEAST_SIGMA_MM, UNSEEN_SIGMA_MM).astype(np.float32)
 
 

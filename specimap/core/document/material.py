@@ -111,7 +111,7 @@ def _preview(folder: Path) -> Bytes | None:
     image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 3 or image.shape[2] != 4:
         return None
-    return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA)  # type: ignore[no-any-return]
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA), np.uint8)
 
 
 def _errors(folder: Path, cloud: Cloud, path: Path) -> Errors:

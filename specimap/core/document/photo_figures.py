@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 
 from specimap.core import plotting as p
 from specimap.core.document.material import Bytes
@@ -120,7 +121,7 @@ def draw_residuals(photos: Sequence[PhotoCorners], factor: float) -> Figure:
     p.styled(by_photo, title="RMS of each photo", x="photo", y="RMS, px")
     by_photo.bar(np.arange(len(photos)) + 1, [_rms(photo) for photo in photos], color=p.BLUE, width=0.7)
     by_photo.set_xlim(0.3, len(photos) + 0.7)
-    by_photo.xaxis.get_major_locator().set_params(integer=True)  # type: ignore[call-arg]
+    by_photo.xaxis.set_major_locator(MaxNLocator(integer=True))
     by_photo.grid(False, axis="x")
     return figure
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from specimap.core.errors import NotFoundError
 from specimap.core.evidence.capture import Capture, find_capture
@@ -16,7 +17,7 @@ MOVED = "specimen moved"
 """No registration by markers can make good for it; what counts is whether it is noticed."""
 QUICK_DEFECTS = ("none", "blur", "tilted cards", MOVED)
 SEEDS = (1, 2, 3)
-DEFECTS: dict[str, dict[str, object]] = {
+DEFECTS: dict[str, dict[str, Any]] = {
     "none": {},
     "blur": {"blur_px": 1.0},
     "strong blur": {"blur_px": 1.5},
@@ -55,7 +56,7 @@ def cases(seeds: tuple[int, ...], acquisitions: tuple[Path, ...], *, quick: bool
         if not capture.has_truth:
             raise NotFoundError(f"{capture.folder} holds no truth.npz.", advice="Only what has truth can validate.")
     phantoms = [
-        Case(name, seed, replace(base, seed=seed, **DEFECTS[name]))  # type: ignore[arg-type]
+        Case(name, seed, replace(base, seed=seed, **DEFECTS[name]))
         for name in names for seed in seeds
     ]  # fmt: skip
     return [*phantoms, *(Case(capture.name, None, capture=capture) for capture in captures)]

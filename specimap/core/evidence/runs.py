@@ -130,11 +130,6 @@ def _as_one(progress: Callable[[float], None]) -> Progress:
     return heard
 
 
-def within(progress: Callable[[float], None], start: float, end: float) -> Callable[[float], None]:
-    """Progress of a part, 0..1, as progress of the whole between ``start`` and ``end``."""
-    return lambda share: progress(start + (end - start) * share)
-
-
 def stopping(progress: Callable[[float], None], cancelled: Callable[[], bool]) -> Callable[[float], None]:
     """Progress that stops what it tells of, by ``CancelledError``, where a stop was asked for."""
 

@@ -13,12 +13,13 @@ from specimap import __version__
 from specimap.core.cube import open_cube
 from specimap.core.errors import OutputExistsError, SettingsError
 from specimap.core.evidence.capture import Capture
-from specimap.core.evidence.runs import Outcome, run_and_judge, scratch_in, within
+from specimap.core.evidence.runs import Outcome, run_and_judge, scratch_in
 from specimap.core.evidence.truth import some
 from specimap.core.files import write_text
 from specimap.core.pipeline import Inputs, PipelineSettings
 from specimap.core.pipeline.keys import register_key, surface_keys
 from specimap.core.pipeline.outputs import prepare_folder
+from specimap.core.progress import within
 from specimap.core.report import Section
 
 SCHEMA_VERSION = 1

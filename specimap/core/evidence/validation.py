@@ -16,12 +16,13 @@ from specimap.core.adjust import Form
 from specimap.core.errors import OutputExistsError
 from specimap.core.evidence.capture import Capture, find_capture
 from specimap.core.evidence.cases import Case
-from specimap.core.evidence.runs import Outcome, run_and_judge, scratch_in, stopping, within
+from specimap.core.evidence.runs import Outcome, run_and_judge, scratch_in, stopping
 from specimap.core.files import write_text
 from specimap.core.phantom import load_truth, write_phantom
 from specimap.core.pipeline import Inputs, PipelineSettings
 from specimap.core.pipeline.artefacts import FORMAT
 from specimap.core.pipeline.outputs import prepare_folder
+from specimap.core.progress import within
 from specimap.core.register.register import Method
 from specimap.core.report import Section
 

@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap.core.colour import srgb_from_linear
 from specimap.core.geometry import View
 from specimap.core.phantom import materials
-from specimap.core.phantom.render import CLASS_SPECIMEN, Paint, Rendering, render_view, srgb_from_linear
+from specimap.core.phantom.render import CLASS_SPECIMEN, Paint, Rendering, render_view
 from specimap.core.phantom.scene import Scene, build_scene
 from specimap.core.phantom.settings import PhantomSettings, Stream
 from specimap.core.phantom.specimen import displacement

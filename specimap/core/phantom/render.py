@@ -163,11 +163,3 @@ def _specimen_colour(
 
 def _lit(irradiance: Floats32, paint: Paint) -> Floats32:
     return np.asarray(1 + paint.shading * (irradiance - 1), np.float32)
-
-
-def srgb_from_linear(linear: Floats32) -> Floats32:
-    """Linear light to sRGB's encoding (IEC 61966-2-1), both 0..1; values outside are clipped."""
-    x = np.clip(linear, 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4, dtype=np.float32) - 0.055).astype(
-        np.float32
-    )

@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specimap.core.acquisition import Photo
+from specimap.core.colour import linear_from_srgb, srgb_from_linear
 from specimap.core.errors import SpecimapError
-from specimap.core.fiducials import linear_from_srgb
 from specimap.core.geometry import Floats, Intrinsics, Pose, rotation_from_vector, skew
 from specimap.core.reconstruct.backend import CornersInPhotos
 from specimap.core.reconstruct.markers import solve_from_markers
-from specimap.core.solver import HUBER, MEDIAN_OF_RAYLEIGH, MarkerScene, Observations
+from specimap.core.robust import MEDIAN_OF_RAYLEIGH
+from specimap.core.solver import HUBER, MarkerScene, Observations
 
 PRIOR_ZOOM = 0.02
 """Standard deviation of the logarithm of a zoom before anything is seen."""
@@ -158,6 +159,4 @@ def image_at_shared(image: NDArray[np.uint8], zoom: float) -> NDArray[np.uint8]:
     light = cv2.warpAffine(
         linear_from_srgb(image), from_shared, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
     )
-    light = np.clip(light, 0, 1)
-    encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-    return np.asarray(255 * encoded + 0.5, np.uint8)
+    return np.asarray(255 * srgb_from_linear(light) + 0.5, np.uint8)

@@ -11,14 +11,20 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from specimap.core.geometry import Floats, Intrinsics, Pose
-from specimap.core.reconstruct.depth import Bytes, DepthMap, DepthSettings, Volume, choose_pairs, match_pair
+from specimap.core.reconstruct.depth import (
+    Bytes,
+    DepthMap,
+    DepthSettings,
+    Volume,
+    before_shrinking,
+    choose_pairs,
+    match_pair,
+)
 
 COARSE_PX = 256
 COARSE_PAIRS = 10
 COARSE_CELLS = 40
 """Cells of the coarse grid along the volume's diagonal."""
-ALIAS_SIGMA = 0.5
-"""Standard deviation of an image's own blur in its pixels; shrinking adds in squares what it lacks."""
 
 
 def find_content(
@@ -87,9 +93,7 @@ def dense_depth(
     pairs = choose_pairs(poses, volume.centre, settings)
     content = find_content(images, lens, poses, volume, pairs, settings, workers)
     shrinkage = settings.shrinkage(lens)
-    # What the smaller virtual images cannot hold would alias.
-    blur = ALIAS_SIGMA * float(np.sqrt(1 / shrinkage**2 - 1))
-    images = [np.asarray(cv2.GaussianBlur(image, (0, 0), blur)) for image in images] if blur else images
+    images = [before_shrinking(image, shrinkage) for image in images]
     maps: list[DepthMap] = []
 
     def run(pair: tuple[int, int]) -> DepthMap | None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from specimap.core.geometry import Floats, Intrinsics, Pose, View
 
 MOST_DISPARITIES = 512
+OWN_BLUR_PX = 0.5
 
 Bytes = NDArray[np.uint8]
 Singles = NDArray[np.float32]
@@ -49,6 +50,14 @@ class DepthSettings:
     def shrinkage(self, lens: Intrinsics) -> float:
         """Factor by which photos of ``lens`` are shrunk before they are matched."""
         return min(self.matching_share, self.most_matching_px / max(lens.width, lens.height))
+
+
+def before_shrinking(image: Bytes, factor: float) -> Bytes:
+    """The image (H, W, 3) without what it could not hold at ``factor`` of its size, which would alias."""
+    if factor >= 1:
+        return image
+    # An image's own blur is about half its pixel; shrunk it must be half of the larger one.
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), OWN_BLUR_PX * float(np.sqrt(1 / factor**2 - 1))), np.uint8)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from specimap.core.geometry import Floats, View
 from specimap.core.points import on_card, on_specimen, raised_mm
 from specimap.core.raycast import RayCaster
 from specimap.core.register.tiles import LEAST_TILES, Tiles
+from specimap.core.robust import SIGMA_OF_MAD
 
 PIXEL_MM = 0.2
 """Working pixel on the marker plane: finer detail differs between a photo's and a cube's lens."""
@@ -239,7 +240,7 @@ def _rigid(
         answer = np.linalg.lstsq(A * root[:, None], np.concatenate([d[:, 0], d[:, 1]]) * root, rcond=None)[0]
         turned = np.stack([-centres[:, 1], centres[:, 0]], -1) * answer[2]
         off = np.linalg.norm(offsets - answer[:2] - turned, axis=1)
-        limit = max(2.5 * 1.4826 * float(np.median(off[keep])) / 1.18, 0.5)
+        limit = max(2.5 * SIGMA_OF_MAD * float(np.median(off[keep])) / 1.18, 0.5)
         kept = np.isfinite(off) & (weight > 0) & (off < limit)
         if kept.sum() < LEAST_TILES or (kept == keep).all():
             break

@@ -38,10 +38,21 @@ class Settled:
     shift: Shift | None
 
     @property
+    def moved(self) -> bool:
+        """Whether the specimen lies elsewhere in the cube than in the photos."""
+        return self.shift is not None and self.shift.significant
+
+    @property
     def sideways_mm(self) -> float:
         """Sideways standard deviation of a registered pixel of the specimen."""
-        if self.shift is not None and self.shift.significant:
-            return self.shift.moved_mm  # whoever moved it, the spectra lie beside their places by this much
+        if self.shift is not None and self.moved:
+            # Spectra lie beside their places by this much, and the camera may add its own.
+            return float(np.hypot(self.shift.moved_mm, self.camera_mm))
+        return self.camera_mm
+
+    @property
+    def camera_mm(self) -> float:
+        """The camera's part of it."""
         if self.by_specimen and self.shift is not None:
             return float(np.hypot(self.shift.sigma_mm, SHARED_MM))
         misfit = self.camera.rms_px * self.camera.pixel_mm
@@ -51,10 +62,10 @@ class Settled:
     def remarks(self) -> list[tuple[str, str]]:
         """What the report should say of it."""
         said: list[tuple[str, str]] = []
-        if self.shift is not None and self.shift.significant:
+        if self.shift is not None and self.moved:
             said.append(("specimen_moved", self.shift.message))
-        if self.sideways_mm > LOOSE_MM:
-            text = f"The markers in the cube leave open where raised tissue lies, by about {self.sideways_mm:.1f} mm."
+        if self.camera_mm > LOOSE_MM:
+            text = f"The markers in the cube leave open where raised tissue lies, by about {self.camera_mm:.1f} mm."
             said.append(("cube_camera_loose", text))
         return said
 

@@ -26,6 +26,7 @@ from specimap.core.reconstruct.da3.settings import NAME, PREFIX, Da3Settings, se
 from specimap.core.reconstruct.depth import Bytes, DepthMap, Singles, Volume, cropped_map, inside_volume, volume_over
 from specimap.core.reconstruct.learned.alignment import LARGEST_SCATTER, align, depths_at, on_markers
 from specimap.core.reconstruct.learned.process import Answer, run_child
+from specimap.core.reconstruct.learned.remarks import left_out, ran
 from specimap.core.reconstruct.posing import pose_photos
 
 CHILD = Path(__file__).with_name("child.py")
@@ -37,7 +38,6 @@ TOLERANCE = 0.01
 """Share of the depth by which views may differ and still confirm each other; more where they scatter more."""
 
 LICENCE = ("licence_apache", "Depth Anything 3's code and its SMALL and BASE weights are under the Apache licence 2.0.")
-UNALIGNED = "depth_unaligned"
 
 
 class Da3Backend:
@@ -99,14 +99,11 @@ class Da3Backend:
             metric.append(in_millimetres(points, view, depth, settings.seed))
         progress(0.95)
         maps = maps_of(images, views, metric, volume, workers)
-        facts = answer.facts
         remarks = (
             LICENCE,
-            ("backend_run", f"Depth Anything 3, {facts['variant']}, ran {facts['seconds']:.0f} s on {facts['device']} "
-                            f"(torch {facts['torch']}); sha256 of its weights, "
-                            f"{'pinned' if weights.pinned else 'not pinned'}: {weights.sha256}."),
+            ran(f"Depth Anything 3, {answer.facts['variant']},", answer.facts, weights),
             *_unaligned(shown, metric),
-        )  # fmt: skip
+        )
         progress(1.0)
         return Reconstruction(
             posed.photos, posed.lens, posed.poses, tuple(maps), sparse_points(maps, posed.poses),
@@ -167,10 +164,7 @@ def _unaligned(photos: list[Photo], metric: list[Metric | None]) -> list[tuple[s
             advice="Use the default backend, or weights that fit the code of Depth Anything 3.",
             photos=left,
         )
-    if not left:
-        return []
-    return [(UNALIGNED, f"The network's depth of {len(left)} of {len(photos)} photos fits neither markers nor "
-                        f"features and is left out: {', '.join(left)}.")]  # fmt: skip
+    return left_out("Depth Anything 3", "markers and features", left, len(photos))
 
 
 def smooth_surface(depth: Singles, view: View) -> Singles:

@@ -7,7 +7,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from specimap.core.geometry import Floats
 from specimap.core.reconstruct.depth import Singles
-from specimap.core.reconstruct.learned.alignment import NEAR, SIGMA_OF_MAD
+from specimap.core.reconstruct.learned.alignment import NEAR
+from specimap.core.robust import SIGMA_OF_MAD
 
 REACH = 0.025
 """Sd of the kernel that spreads what known places show, as a share of the picture's longer side: 2 mm on a specimen."""

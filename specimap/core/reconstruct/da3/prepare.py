@@ -11,10 +11,7 @@ import numpy as np
 from specimap.core.geometry import Floats, Intrinsics, Pose
 from specimap.core.reconstruct.agreement import sights
 from specimap.core.reconstruct.da3.settings import PATCH_PX
-from specimap.core.reconstruct.depth import Bytes
-
-BLUR = 0.45
-"""Gaussian sd before shrinking, in units of the root of the squared factor less one: keeps texture from aliasing."""
+from specimap.core.reconstruct.depth import Bytes, before_shrinking
 
 
 @dataclass(frozen=True)
@@ -46,11 +43,10 @@ class Preparation:
 
     def apply(self, image: Bytes) -> Bytes:
         """The photo (H, W, 3) as the network's image."""
-        if self.scale < 1:
-            image = np.asarray(cv2.GaussianBlur(image, (0, 0), BLUR * (self.scale**-2 - 1) ** 0.5), np.uint8)
         maps = cv2.initUndistortRectifyMap(
             self.lens.matrix, self.lens.distortion, np.eye(3), self.intrinsics.matrix, self.size, cv2.CV_32FC1
         )
+        image = before_shrinking(image, self.scale)
         return np.asarray(cv2.remap(image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 

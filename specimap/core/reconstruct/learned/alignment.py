@@ -14,6 +14,7 @@ from scipy.ndimage import map_coordinates
 
 from specimap.core.geometry import Floats, View
 from specimap.core.reconstruct.depth import Singles
+from specimap.core.robust import SIGMA_OF_MAD
 from specimap.core.solver import Observations
 
 MARKER_STEPS = 6
@@ -35,7 +36,6 @@ SHIFT_SPREAD = 0.05
 """Known depths must differ by this share of their middle for a shift to be told from a scale."""
 ROUNDS = 20
 TUKEY = 4.685
-SIGMA_OF_MAD = 1.4826
 LEAST_SIGMA = 1e-4
 
 

@@ -22,7 +22,7 @@ from specimap.core.reconstruct.backend import (
 )
 from specimap.core.reconstruct.learned.placing import place_by_markers
 from specimap.core.reconstruct.learned.process import Answer, run_child
-from specimap.core.reconstruct.learned.weights import Weights
+from specimap.core.reconstruct.learned.remarks import left_out, ran
 from specimap.core.reconstruct.mast3r.images import Preparation, plan_preparation
 from specimap.core.reconstruct.mast3r.maps import depth_maps
 from specimap.core.reconstruct.mast3r.metric import Predicted, hold_to_markers, network_lens
@@ -104,21 +104,8 @@ class Mast3rBackend:
         progress(1.0)
         return Reconstruction(
             used, metric.lens, kept, maps, sparse_points(list(maps), kept), refused,
-            (LICENCE, told(answer, weights), *unaligned(without, len(used))),
+            (LICENCE, ran("MASt3R", answer.facts, weights), *left_out("MASt3R", "the markers", without, len(used))),
         )  # fmt: skip
-
-
-def told(answer: Answer, weights: Weights) -> tuple[str, str]:
-    """What ran, for the report."""
-    facts = answer.facts
-    pinned = "pinned" if weights.pinned else "not pinned"
-    took = facts.get("device_memory_bytes", 0)
-    memory = f", with {took / 1e9:.1f} GB of its memory" if took else ""
-    return (
-        "backend_run",
-        f"MASt3R ran {facts['seconds']:.0f} s on {facts['device']}{memory} (torch {facts['torch']}); "
-        f"sha256 of its weights, {pinned}: {weights.sha256}.",
-    )
 
 
 def cameras_of(answer: Answer, plan: Preparation) -> tuple[Intrinsics, tuple[Pose, ...]]:
@@ -140,11 +127,3 @@ def predicted_by(answer: Answer) -> Predicted:
         for focal, (cx, cy) in zip(answer.arrays["focal"], answer.arrays["centre"], strict=True)
     )
     return Predicted(lenses, answer.arrays["depth"], answer.arrays["confidence"])
-
-
-def unaligned(names: list[str], of: int) -> list[tuple[str, str]]:
-    """The remark on photos whose depth is left out."""
-    if not names:
-        return []
-    return [("depth_unaligned", f"MASt3R's depth of {len(names)} of {of} photos does not fit the markers and is left "
-                                f"out: {', '.join(names)}.")]  # fmt: skip

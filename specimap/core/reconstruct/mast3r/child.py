@@ -55,7 +55,7 @@ def run(
     sparse_ga.tqdm = bars(step)  # type: ignore[attr-defined]
     names = [str(k) for k in range(len(arrays["images"]))]
     coarse, fine = request["schedule"]
-    with typed_failures(request["names"]):
+    with TypedFailures(request["names"]):
         scene = sparse_ga.sparse_global_alignment(
             names, list(pairs_of(arrays["images"], request["pairs"])), request["folder"] + "/cache", network,
             subsample=request["subsample"], device=device, shared_intrinsics=True, opt_pp=False, opt_depth=True,
@@ -162,7 +162,7 @@ def bars(step: Step) -> Callable[..., Any]:
     return Bar
 
 
-class typed_failures:  # noqa: N801 - used as a function
+class TypedFailures:
     """Turn what upstream asserts, or stumbles over, into failures that say what is wrong with the photos."""
 
     def __init__(self, names: list[str]) -> None:
