@@ -154,3 +154,17 @@ def test_unknown_markers_and_formats_are_refused(tmp_path: Path) -> None:
         write_phantom(TINY, tmp_path, photo_format="gif")
     with pytest.raises(NotFoundError):
         load_truth(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"# a page of text", b"PK\x03\x04 cut off"])
+def test_a_file_that_is_no_truth_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "truth.npz"
+    path.write_bytes(content)
+    with pytest.raises(NotFoundError, match="is not a phantom's truth"):
+        load_truth(path)
+
+
+def test_arrays_of_something_else_are_no_truth(tmp_path: Path) -> None:
+    np.savez(tmp_path / "truth.npz", depth=np.zeros(3))
+    with pytest.raises(NotFoundError, match="is not a phantom's truth"):
+        load_truth(tmp_path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,11 +96,20 @@ def save_truth(truth: Truth, path: Path) -> None:
 def load_truth(path: Path) -> Truth:
     """Read a phantom's ``truth.npz``, or that of the folder ``path``.
 
-    Raises ``NotFoundError`` if the file is not there, or says no photo size and has no photo beside it.
+    Raises ``NotFoundError`` if the file is not there or is none, or says no photo size and has no photo beside it.
     """
     file = path / "truth.npz" if path.is_dir() else path
     if not file.is_file():
         raise NotFoundError(f"There is no {file}.", advice="Give a phantom's folder or its truth.npz.")
+    try:
+        return _read(file)
+    except (ValueError, KeyError, EOFError, BadZipFile) as error:
+        raise NotFoundError(
+            f"{file} is not a phantom's truth.", advice="Give a phantom's folder or its truth.npz."
+        ) from error
+
+
+def _read(file: Path) -> Truth:
     with np.load(file, allow_pickle=False) as z:
         names = [str(n) for n in z["rgb_files"]]
         sizes = z["rgb_size"] if "rgb_size" in z else [_photo_size(file.parent / n) for n in names]

@@ -247,7 +247,7 @@ class _Plan:
     def _install(self, module: str) -> str:
         if not module:
             return f"Correct {self.prefix}PYTHON."
-        return install_command(self.python, [module])
+        return install_command(self.python, [module], self.prefix)
 
 
 def _weights_facts(weights: Weights) -> dict[str, Any]:
@@ -282,9 +282,13 @@ DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "depth_anythi
 """Packages that are called otherwise than their modules."""
 
 
-def install_command(python: str, modules: list[str]) -> str:
-    """The command that installs what brings the modules."""
-    return f"{python} -m pip install {' '.join(DISTRIBUTIONS.get(name, name) for name in modules)}"
+def install_command(python: str, modules: list[str], prefix: str) -> str:
+    """The command that installs what brings the modules, for the backend whose variables begin with ``prefix``."""
+    what = " ".join(DISTRIBUTIONS.get(name, name) for name in modules)
+    if python == sys.executable:
+        # Networks ask for an older numpy and another OpenCV than the program that runs here.
+        return f"python3 -m venv ENV; ENV/bin/pip install {what}; export {prefix}PYTHON=ENV/bin/python"
+    return f"{python} -m pip install {what}"
 
 
 def _install_pipeline(_module: str) -> str:

@@ -60,7 +60,6 @@ def check_backend(name: str) -> None:
         module, why = next(iter(missing.items()))
         raise BackendUnavailableError(
             f"{name} needs {', '.join(missing)}, which the interpreter {python} cannot import ({module}: {why}).",
-            advice=f"{install_command(python, list(missing))}; or name another interpreter in "
-            f"SPECIMAP_{name.upper()}_PYTHON.",
+            advice=install_command(python, list(missing), f"SPECIMAP_{name.upper()}_"),
             missing=list(missing),
         )
