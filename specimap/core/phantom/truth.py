@@ -110,7 +110,7 @@ def load_truth(path: Path) -> Truth:
 
 
 def _read(file: Path) -> Truth:
-    with np.load(file, allow_pickle=False) as z:
+    with open(file, "rb") as f, np.load(f, allow_pickle=False) as z:  # a damaged file is closed, too
         names = [str(n) for n in z["rgb_files"]]
         sizes = z["rgb_size"] if "rgb_size" in z else [_photo_size(file.parent / n) for n in names]
         views = [
