@@ -17,7 +17,6 @@ from specimap.cli.keys import keys_app
 from specimap.cli.progress import Listener, json_listener, progress_listener
 from specimap.cli.report import report
 from specimap.cli.telling import Debug, stoppable, told
-from specimap.core.errors import NotFoundError
 
 app = typer.Typer(
     add_completion=False,
@@ -132,20 +131,11 @@ def info(
     """Print the report of a run."""
     with told(json_listener() if json_events else progress_listener(), debug):
         from specimap.cli.tables import print_report
-        from specimap.core.report import Report
+        from specimap.core.report import read_report
 
-        path = out / "report.json"
-        if not path.is_file():
-            raise NotFoundError(f"{out} holds no report.", advice="Name the folder of a finished run.")
-        text = path.read_text(encoding="utf-8", errors="replace")
-        try:
-            report = Report.model_validate_json(text)
-        except ValueError as error:
-            raise NotFoundError(
-                f"{path} is not a report that this version of Specimap reads.", advice="Repeat the run."
-            ) from error
+        report = read_report(out)
         if json_events:
-            sys.stdout.write(text + "\n")
+            sys.stdout.write((out / "report.json").read_text(encoding="utf-8") + "\n")
         else:
             print_report(report)
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Annotated
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+from specimap.core.errors import NotFoundError
 
 # JSON has no NaN: a figure that could not be had is null there.
 Figure = Annotated[float, BeforeValidator(lambda value: float("nan") if value is None else value)]
@@ -213,3 +216,20 @@ _DETAILS = {"photo_corners", "cube_corners"}
 
 def _compact(section: Section) -> str:
     return json.dumps(section.model_dump(mode="json"), separators=(",", ":"), ensure_ascii=False)
+
+
+def read_report(folder: Path) -> Report:
+    """The report of the finished run in ``folder``.
+
+    Raises:
+        NotFoundError: there is none that this version reads.
+    """
+    path = folder / "report.json"
+    if not path.is_file():
+        raise NotFoundError(f"{folder} holds no report.", advice="Name the folder of a finished run.")
+    try:
+        return Report.model_validate_json(path.read_text(encoding="utf-8", errors="replace"))
+    except ValueError as error:
+        raise NotFoundError(
+            f"{path} is not a report that this version of Specimap reads.", advice="Repeat the run."
+        ) from error

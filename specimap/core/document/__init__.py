@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from specimap.core.document.compose import compose
-from specimap.core.document.material import read_material, read_report
+from specimap.core.document.material import read_material
 from specimap.core.document.page import write_page
 from specimap.core.document.printed import write_pdf
 
@@ -41,4 +41,4 @@ def write_document(
     return write_page(document, target, progress) if format == "html" else write_pdf(document, target, progress)
 
 
-__all__ = ["DocumentFormat", "read_report", "write_document"]
+__all__ = ["DocumentFormat", "write_document"]

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 
 from specimap.core.document.blocks import Block, Bullets, Callout, Document, Level, Paragraph, Section, Table
 from specimap.core.document.illustrate import corner_blocks, coverage_blocks, photo_blocks, surface_blocks, truth_blocks
-from specimap.core.document.material import Errors, Material
+from specimap.core.document.material import Material
 from specimap.core.document.words import (
     MEANINGS,
     REFUSALS,
@@ -20,6 +20,7 @@ from specimap.core.document.words import (
     verdict,
 )
 from specimap.core.evidence import published
+from specimap.core.evidence.truth import Judged
 from specimap.core.report import LeaveOneOut, MethodFigures, Report
 
 STAGE_NAMES = {
@@ -54,10 +55,10 @@ def compose(material: Material) -> Document:
     )
 
 
-def _verdict(report: Report, errors: Errors | None) -> Iterator[Block]:
+def _verdict(report: Report, errors: Judged | None) -> Iterator[Block]:
     said = verdict(report)
     if errors is not None:
-        found = errors.judged.errors
+        found = errors.errors
         truth = f"Against truth the median error is {mm(found.median)} mm, and 95 % are below {mm(found.p95)} mm."
         said = replace(said, sentences=(*said.sentences, truth))
     yield Callout(said.level, said.title, " ".join(said.sentences), " ".join(said.actions))

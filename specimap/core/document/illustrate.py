@@ -151,7 +151,7 @@ def truth_blocks(material: Material) -> Iterator[Block]:
     errors = material.errors
     if errors is None:
         return
-    found = errors.judged.errors
+    found = errors.errors
     yield Paragraph(
         "This acquisition is of a phantom whose shape is known exactly. The error is the distance of each point of the "
         "specimen from where its pixel truly looked, after a rotation and a shift that bring the corners onto the true "
@@ -166,8 +166,8 @@ def truth_blocks(material: Material) -> Iterator[Block]:
             ("Pixels of the specimen that have a point", f"{100 * found.coverage:.2f} %"),
             ("Size of the result over the true one", f"{100 * found.scale:+.2f} %"),
             ("Marker corners, median", f"{mm(found.corner_mm)} mm"),
-            ("Errors within one stated sigma", f"{100 * errors.judged.within(1):.1f} %"),
-            ("Errors within two stated sigmas", f"{100 * errors.judged.within(2):.1f} %"),
+            ("Errors within one stated sigma", f"{100 * errors.within(1):.1f} %"),
+            ("Errors within two stated sigmas", f"{100 * errors.within(2):.1f} %"),
         ),
         (0.6, 0.4),
         numeric=(1,),

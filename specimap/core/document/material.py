@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,28 +12,14 @@ from numpy.typing import NDArray
 
 from specimap.core.cloud import Cloud
 from specimap.core.document.maps import Above, CubeFrame, cube_frame, from_above
-from specimap.core.errors import NotFoundError, PhotoUnreadableError, SettingsError
-from specimap.core.geometry import Array, Floats
+from specimap.core.errors import PhotoUnreadableError
 from specimap.core.photosheet import read_tiles
-from specimap.core.report import Report
+from specimap.core.report import Report, read_report
 
 if TYPE_CHECKING:
     from specimap.core.evidence.truth import Judged
 
 Bytes = NDArray[np.uint8]
-
-
-@dataclass(frozen=True, eq=False)
-class Errors:
-    """A run ``judged`` against truth, and the ``points`` (n,) of the cloud that its errors (n,) are of."""
-
-    judged: Judged
-    points: NDArray[np.intp]
-
-    @property
-    def errors_mm(self) -> Floats:
-        """(n,) distance of each point from where its pixel truly looked."""
-        return self.judged.errors.errors_mm
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +31,7 @@ class Material:
     shape: tuple[int, int]
     tiles: tuple[Bytes, ...]
     preview: Bytes | None
-    errors: Errors | None
+    errors: Judged | None
 
     @cached_property
     def frame(self) -> CubeFrame:
@@ -74,21 +59,12 @@ def read_material(folder: Path, truth: Path | None = None) -> Material:
         shape = report.cube_corners.rows, report.cube_corners.cols
     else:
         shape = (int(cloud.hsi_pixel[:, 0].max()) + 1, int(cloud.hsi_pixel[:, 1].max()) + 1)
-    errors = None if truth is None else _errors(folder, cloud, truth)
+    errors = None
+    if truth is not None:
+        from specimap.core.evidence.truth import judge_with_sigma
+
+        errors = judge_with_sigma(folder, truth)
     return Material(report, cloud, shape, _tiles(folder, report), _preview(folder), errors)
-
-
-def read_report(folder: Path) -> Report:
-    """The report of a finished run. Raises NotFoundError where there is none, or none that this version reads."""
-    path = folder / "report.json"
-    if not path.is_file():
-        raise NotFoundError(f"{folder} holds no report.", advice="Name the folder of a finished run.")
-    try:
-        return Report.model_validate_json(path.read_text(encoding="utf-8", errors="replace"))
-    except ValueError as error:
-        raise NotFoundError(
-            f"{path} is not a report that this version of Specimap reads.", advice="Repeat the run."
-        ) from error
 
 
 def _tiles(folder: Path, report: Report) -> tuple[Bytes, ...]:
@@ -112,30 +88,3 @@ def _preview(folder: Path) -> Bytes | None:
     if image is None or image.ndim != 3 or image.shape[2] != 4:
         return None
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA), np.uint8)
-
-
-def _errors(folder: Path, cloud: Cloud, path: Path) -> Errors:
-    from specimap.core.evidence.truth import SPECIMEN, judge_with_sigma
-    from specimap.core.phantom import load_truth
-
-    truth = load_truth(path)
-    known = json.loads((folder / "corners.json").read_text(encoding="utf-8"))
-    pixels = cloud.hsi_pixel
-    common = [i for i in truth.marker_ids.tolist() if str(i) in known]
-    if not common or (pixels.max(0) >= truth.hsi_class.shape).any():
-        raise SettingsError(
-            f"{path} is not the truth of this run: its markers or its cube are others.",
-            advice="Give the truth.npz of the phantom that the photos and the cube came from.",
-            setting="truth",
-        )
-    found = judge_with_sigma(folder, path)
-    at = pixels[:, 0], pixels[:, 1]
-    # The points that were judged, in their order.
-    points = np.flatnonzero((truth.hsi_class[at] == SPECIMEN) & _finite(truth.hsi_xyz[at]) & _finite(cloud.xyz))
-    if len(points) != len(found.sigma_mm):
-        raise RuntimeError(f"{len(found.sigma_mm)} points were judged, {len(points)} were expected")
-    return Errors(found, points)
-
-
-def _finite(xyz: Array) -> NDArray[np.bool_]:
-    return np.asarray(np.isfinite(xyz).all(1))

@@ -10,13 +10,15 @@ from numpy.typing import NDArray
 from specimap.core import plotting as p
 from specimap.core.cloud import Cloud, Flag
 from specimap.core.document.maps import Above, CubeFrame
-from specimap.core.document.material import Bytes, Errors
+from specimap.core.document.material import Bytes
 from specimap.core.document.photo_figures import corners_of
 from specimap.core.report import CubeCorners
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from specimap.core.evidence.truth import Judged
 
 MOST_HIGH_IN = 5.3
 KINDS = (
@@ -138,7 +140,7 @@ def draw_sigma_histogram(cloud: Cloud) -> Figure:
     return figure
 
 
-def draw_error_map(errors: Errors, frame: CubeFrame) -> Figure:
+def draw_error_map(errors: Judged, frame: CubeFrame) -> Figure:
     """The distance of each point of the specimen from where its pixel truly looked."""
     figure, ax = _in_cube(frame, "Error of the position against truth")
     shown = ax.imshow(
@@ -150,7 +152,7 @@ def draw_error_map(errors: Errors, frame: CubeFrame) -> Figure:
     return figure
 
 
-def draw_reliability(errors: Errors) -> Figure:
+def draw_reliability(errors: Judged) -> Figure:
     """How the errors are spread, and what share of them lies within k stated standard deviations."""
     figure = p.figure(p.WIDTH_IN, 3.1)
     spread, within = figure.subplots(1, 2)
@@ -163,7 +165,7 @@ def draw_reliability(errors: Errors) -> Figure:
     spread.set_ylim(0, 1.02)
     k = np.linspace(0, 4, 81)
     p.styled(within, title="Are the stated sigmas right?", x="k", y="share of errors within k sigma")
-    within.plot(k, [errors.judged.within(v) for v in k.tolist()], color=p.BLUE, linewidth=1.8, label="this run")
+    within.plot(k, [errors.within(v) for v in k.tolist()], color=p.BLUE, linewidth=1.8, label="this run")
     within.plot(*zip(*NORMAL_WITHIN, strict=True), color=p.VERMILION, marker="o", markersize=5, linestyle="none",
                 label="normal distribution")  # fmt: skip
     within.set_xlim(0, 4)

@@ -57,6 +57,8 @@ REFUSALS = {
     "photo_foreign": "Leave it out if it shows something else; else show the markers in it.",
     "photo_unlocated": "Take it again with two or more markers in view, between its neighbours.",
 }
+GRAVE = ("specimen_moved", "cube_camera_loose", "scale_implausible", "scale_contradicts_exif")
+"""Warnings that put all places in doubt."""
 UNKNOWN_REFUSAL = "Take it again from the same side with the markers in view."
 
 MEANINGS = (
@@ -160,15 +162,18 @@ class Verdict:
 def verdict(report: Report) -> Verdict:
     """Whether the result holds what can be expected of it, and what to do where it does not."""
     failed = [check for check in checks(report) if not check.good]
-    warned = len(report.warnings)
-    said = [placed(report), used(report)]
-    if not failed:
-        title = "The result holds what can be expected" + (", with the warnings below." if warned else ".")
-        level: Level = "note" if warned else "good"
-    else:
+    grave = [w for w in report.warnings if w.code in GRAVE]
+    said = [placed(report), used(report), *(w.message for w in grave)]
+    level: Level = "attention"
+    if grave:
+        title = "Look before use: all places are in doubt."
+    elif failed:
         title = f"Look before use: {len(failed)} of {len(checks(report))} checks failed."
-        level = "attention"
-    actions = [check.action for check in failed]
+    elif report.warnings:
+        title, level = "The result holds what can be expected, with the warnings below.", "note"
+    else:
+        title, level = "The result holds what can be expected.", "good"
+    actions = [*(REMARKS[w.code] for w in grave), *(check.action for check in failed)]
     return Verdict(level, title, tuple(said), tuple(actions))
 
 

@@ -29,6 +29,7 @@ from specimap.core.reconstruct.depth import (
     cropped_map,
     inside_volume,
 )
+from specimap.core.reconstruct.learned.environment import DENSE_DEVICE
 from specimap.core.reconstruct.learned.process import run_child
 
 CHILD = Path(__file__).with_name("patchmatch_child.py")
@@ -69,6 +70,21 @@ def what_is_missing() -> str | None:
     return None
 
 
+def check_device(settings: DepthSettings) -> None:
+    """Refuse a GPU that is asked for and not to be had.
+
+    Raises:
+        BackendUnavailableError: PatchMatch cannot run on one here.
+    """
+    missing = what_is_missing() if settings.device == "gpu" else None
+    if missing is not None:
+        raise BackendUnavailableError(
+            f"{DENSE_DEVICE} asks for dense stereo on a GPU. {missing}",
+            advice="docs/backends.md says what it takes; auto takes a GPU only where there is one.",
+            missing=missing,
+        )
+
+
 def measure_depth(
     images: list[Bytes],
     lens: Intrinsics,
@@ -88,11 +104,8 @@ def measure_depth(
         BackendFailedError, DepthNotFoundError: a GPU is asked for, and PatchMatch failed or gave nothing.
     """
     missing = "" if settings.device == "cpu" else what_is_missing()
-    if settings.device == "gpu" and missing is not None:
-        raise BackendUnavailableError(
-            f"Dense stereo on a GPU is asked for. {missing}",
-            advice="Install pycolmap-cuda12 in place of pycolmap on a machine with an NVIDIA GPU, or choose the CPU.",
-        )
+    if missing is not None:
+        check_device(settings)
     said: Remarks = ()
     reached = 0.0
 

@@ -21,8 +21,8 @@ Method = Literal["camera", "homography"]
 GRAZING_DEG = 70.0
 STRIP_PIXELS = 1 << 16
 STRIP_WORKERS = 2
-CLEARANCE_MM = 0.15
-"""How far from a place a ray to whatever may hide it starts: about the surface's own error."""
+CLEARANCE_MM = 0.02
+"""How far from a place a ray to whatever may hide it starts: beyond rounding. More would miss what is hidden closely."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import sys
 from specimap.core.errors import BackendUnavailableError
 from specimap.core.reconstruct.backend import ReconstructSettings
 from specimap.core.reconstruct.learned.availability import DEFAULT_BACKEND, install_command, probe
-from specimap.core.reconstruct.learned.environment import DENSE_DEVICE, backend_found
+from specimap.core.reconstruct.learned.environment import backend_found
 from specimap.core.reconstruct.mast3r.settings import NAME as MAST3R
 
 
@@ -22,19 +22,13 @@ def check_required(settings: ReconstructSettings) -> None:
     """
     # Both load COLMAP, which stage 1 loads anyway.
     from specimap.core.reconstruct.features import check_features
-    from specimap.core.reconstruct.patchmatch import what_is_missing
+    from specimap.core.reconstruct.patchmatch import check_device
 
     if settings.backend != MAST3R:  # it has no use for features
         check_features(settings.features)
     check_backend(settings.backend)
-    if settings.backend == DEFAULT_BACKEND and settings.depth.device == "gpu":
-        missing = what_is_missing()
-        if missing is not None:
-            raise BackendUnavailableError(
-                f"{DENSE_DEVICE} asks for dense stereo on a GPU. {missing}",
-                advice="docs/backends.md says what it takes; auto takes a GPU only where there is one.",
-                missing=missing,
-            )
+    if settings.backend == DEFAULT_BACKEND:
+        check_device(settings.depth)
 
 
 def check_backend(name: str) -> None:
