@@ -29,8 +29,8 @@ OFF_MM = 0.02
 """How far off the true surface a ray to what hides a place starts: beyond rounding, and no more."""
 TRAY_HALF_MM = 60.0
 SHARE = 0.9
-"""Of ten flagged pixels nine are rightly so, and of ten hidden ones nine are flagged, within a pixel: who drops or keeps
-points by a flag must be able to believe it."""
+"""Of ten flagged pixels nine are rightly so, and of ten hidden ones nine are flagged, within a pixel: who drops or
+keeps points by a flag must be able to believe it."""
 METHODS: tuple[Method, ...] = ("camera", "homography")
 
 

@@ -3,8 +3,8 @@
 Pairwise depth is fused at the resolution of its matching windows and leans inward on bumps. Here, patches lying in
 the surface's own tangent plane are compared among up to nine photos at once (mean pairwise normalised
 cross-correlation, as in multi-view stereo since Goesele et al. 2007) for a few offsets along the normal; the best
-offset, to a fraction of the step, is smoothed over neighbours by how sharply it is determined. A second, shorter
-pass starts from the normals that the first has put right.
+offset, to a fraction of the step, is smoothed over neighbours by how sharply it is determined. Further, shorter
+passes start from the normals that those before have put right.
 """
 
 from __future__ import annotations
@@ -13,19 +13,16 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
+from specimap.core.consistency import Photographs, choose_views, patch_scores
 from specimap.core.geometry import Floats, Intrinsics, Pose
 from specimap.core.progress import within
-from specimap.core.raycast import RayCaster
 from specimap.core.surface import Mesh, vertex_normals
 
 CHUNK = 2048
-NOISE_VARIANCE = 4.0
-"""Variance in grey levels that a patch is given on top of its own, so that plain areas do not count as agreeing."""
 
 
 @dataclass(frozen=True)
@@ -43,24 +40,25 @@ class Refined:
 
 @dataclass(frozen=True)
 class Pass:
-    """One round: the farthest offset ``reach_voxels``, how many ``steps`` are tried, ``views`` compared."""
+    """One round: the farthest offset ``reach_voxels``, how many ``steps`` are tried, ``views`` compared;
+    ``half_samples``: the patch is (2 n + 1)^2 samples, a photo's pixel apart on the surface."""
 
     reach_voxels: float
     steps: int
     views: int
+    half_samples: int = 2
 
 
 @dataclass(frozen=True)
 class RefineSettings:
     """Photo-consistent refinement.
 
-    ``passes``: the rounds. ``half_samples``: the patch is (2 n + 1)^2 samples, a photo's pixel apart on the surface.
+    ``passes``: the rounds; the last, on smaller patches, brings out what is narrower than the others'.
     ``least_score``: correlation below which a vertex follows its neighbours. ``smoothness``: weight of the
     neighbours.
     """
 
-    passes: tuple[Pass, ...] = (Pass(2.0, 11, 9), Pass(0.8, 5, 9))
-    half_samples: int = 2
+    passes: tuple[Pass, ...] = (Pass(2.0, 11, 9), Pass(0.8, 5, 9), Pass(0.5, 5, 9, half_samples=1))
     least_score: float = 0.3
     smoothness: float = 0.2
     smoothing_rounds: int = 10
@@ -89,15 +87,14 @@ def refine_mesh(
     ``worth`` (V,): the vertices that are worth the time, all by default; the others keep their places.
     """
     chosen = np.arange(len(mesh.vertices)) if worth is None else np.flatnonzero(worth)
-    greys = [image.astype(np.float32) for image in images]
+    photographs = Photographs([image.astype(np.float32) for image in images], lens, poses)
     cost = [p.steps * p.views for p in settings.passes]
     count = len(mesh.vertices)
     refined = Refined(mesh, np.zeros(count, np.uint8), np.full(count, np.nan, np.float32))
     for k, one in enumerate(settings.passes):
         done, share = sum(cost[:k]) / sum(cost), cost[k] / sum(cost)
         refined = _refined_once(
-            refined, chosen, greys, lens, poses, voxel_mm, settings, one, workers,
-            within(progress, done, done + share),
+            refined, chosen, photographs, voxel_mm, settings, one, workers, within(progress, done, done + share)
         )  # fmt: skip
     progress(1.0)
     return refined
@@ -106,9 +103,7 @@ def refine_mesh(
 def _refined_once(
     start: Refined,
     chosen: NDArray[np.int64],
-    greys: list[NDArray[np.float32]],
-    lens: Intrinsics,
-    poses: tuple[Pose, ...],
+    photographs: Photographs,
     voxel_mm: float,
     settings: RefineSettings,
     one: Pass,
@@ -120,16 +115,16 @@ def _refined_once(
     points, normals = mesh.vertices[chosen].astype(float), mesh.normals[chosen].astype(float)
     if not len(points):
         return start
-    views = choose_views(mesh, chosen, lens, poses, one.views, settings.least_cosine)
+    views = choose_views(mesh, chosen, photographs, one.views, settings.least_cosine)
     progress(0.2)
     reach = one.reach_voxels * voxel_mm
     offsets = np.linspace(-reach, reach, one.steps)
-    sample_mm = pixel_footprint_mm(lens, poses, points.mean(0))
+    sample_mm = pixel_footprint_mm(photographs.lens, photographs.poses, points.mean(0))
     scores = np.zeros((len(points), one.steps), np.float32)
 
     def run(part: slice) -> None:
-        scores[part] = _scores(
-            points[part], normals[part], views[part], greys, lens, poses, offsets, sample_mm, settings.half_samples
+        scores[part] = patch_scores(
+            points[part], normals[part], views[part], photographs, offsets, sample_mm, one.half_samples
         )
 
     parts = [slice(k, k + CHUNK) for k in range(0, len(points), CHUNK)]
@@ -158,99 +153,6 @@ def _refined_once(
     unsettled[chosen] = (apart + edges @ apart)[chosen] / (among + edges @ among)[chosen]
     after = Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), mesh.colours)
     return Refined(after, compared, unsettled)
-
-
-def choose_views(
-    mesh: Mesh,
-    chosen: NDArray[np.int64],
-    lens: Intrinsics,
-    poses: tuple[Pose, ...],
-    most: int,
-    least_cosine: float,
-) -> NDArray[np.int64]:
-    """For each of the ``chosen`` (n,) vertices the photos that see it most squarely and unhidden, (n, most); -1 where
-    there are fewer."""
-    points, normals = mesh.vertices[chosen].astype(float), mesh.normals[chosen].astype(float)
-    cosine = np.empty((len(poses), len(points)), np.float32)
-    margin = 6
-    for k, pose in enumerate(poses):
-        away = pose.centre - points
-        facing = (away * normals).sum(1) / np.linalg.norm(away, axis=1)
-        cam = pose.apply(points)
-        pixels = lens.project(cam)
-        inside = (
-            (cam[:, 2] > 0)
-            & (pixels > margin).all(1)
-            & (pixels < [lens.width - 1 - margin, lens.height - 1 - margin]).all(1)
-        )
-        cosine[k] = np.where(inside, facing, -1)
-    # A few more candidates than needed, since some will be hidden.
-    order = np.argsort(-cosine, axis=0)[: most + 3]
-    seen = np.take_along_axis(cosine, order, 0) > least_cosine
-    rank, vertex = np.nonzero(seen)
-    centres = np.stack([p.centre for p in poses])
-    away = centres[order[rank, vertex]] - points[vertex]
-    away /= np.linalg.norm(away, axis=1, keepdims=True)
-    clearance = 0.4 * away + 0.15 * normals[vertex]
-    hidden = RayCaster(mesh).cast(points[vertex] + clearance, away).hit
-    seen[rank[hidden], vertex[hidden]] = False
-    place = np.cumsum(seen, axis=0)
-    seen &= place <= most
-    views = np.full((len(points), most), -1, np.int64)
-    rank, vertex = np.nonzero(seen)
-    views[vertex, place[rank, vertex] - 1] = order[rank, vertex]
-    return views
-
-
-def _scores(
-    points: Floats,
-    normals: Floats,
-    views: NDArray[np.int64],
-    greys: list[NDArray[np.float32]],
-    lens: Intrinsics,
-    poses: tuple[Pose, ...],
-    offsets: Floats,
-    sample_mm: float,
-    half: int,
-) -> NDArray[np.float32]:
-    """Mean pairwise correlation (m, steps) of the patches at the offsets."""
-    known = views >= 0
-    owner = np.where(known, views, 0)
-    R, t = np.stack([p.R for p in poses])[owner], np.stack([p.t for p in poses])[owner]
-    side = np.arange(-half, half + 1) * sample_mm
-    across, along = (g.ravel().astype(np.float32) for g in np.meshgrid(side, side))
-    helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
-    tangent = np.cross(helper, normals)
-    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
-    other = np.cross(normals, tangent)
-
-    def project(x: Floats) -> Floats:
-        return lens.project(np.einsum("mkij,mj->mki", R, x) + t)
-
-    # Over a millimetre the projection is linear to a thousandth of a pixel: its derivatives serve all samples.
-    small = 0.05
-    base = project(points).astype(np.float32)
-    by_normal = ((project(points + small * normals) - project(points - small * normals)) / (2 * small))
-    by_tangent = ((project(points + small * tangent) - base) / small).astype(np.float32)
-    by_other = ((project(points + small * other) - base) / small).astype(np.float32)
-    patch = by_tangent[:, :, None] * across[:, None] + by_other[:, :, None] * along[:, None]
-    rows_of_view = [(v, *np.nonzero(views == v)) for v in np.unique(views[known])]
-    count = known.sum(1)
-    pairs = np.maximum(count * (count - 1), 1)
-    floor = NOISE_VARIANCE * len(across) / 4
-    out = np.empty((len(points), len(offsets)), np.float32)
-    for k, offset in enumerate(offsets):
-        at = (base + np.float32(offset) * by_normal.astype(np.float32))[:, :, None] + patch
-        values = np.zeros(at.shape[:3], np.float32)
-        for view, row, column in rows_of_view:
-            where = at[row, column]
-            values[row, column] = cv2.remap(greys[view], where[..., 0], where[..., 1], cv2.INTER_LINEAR)
-        values -= values.mean(2, keepdims=True)
-        values /= np.sqrt((values**2).sum(2, keepdims=True) + floor)
-        values *= known[..., None]
-        together = (values.sum(1) ** 2).sum(1) - (values**2).sum((1, 2))
-        out[:, k] = together / pairs
-    return out
 
 
 def _best_offsets(scores: NDArray[np.float32], offsets: Floats) -> tuple[Floats, Floats]:

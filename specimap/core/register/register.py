@@ -22,7 +22,7 @@ GRAZING_DEG = 70.0
 STRIP_PIXELS = 1 << 16
 STRIP_WORKERS = 2
 CLEARANCE_MM = 0.02
-"""How far from a place a ray to whatever may hide it starts: beyond rounding. More would miss what is hidden closely."""
+"""How far from a place a ray to whatever may hide it starts: beyond rounding. More would miss what hides near by."""
 
 
 @dataclass(frozen=True)
