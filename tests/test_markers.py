@@ -11,7 +11,7 @@ from scenes import EDGE_MM, marker_scene, rotation_deg
 from specimap.core.errors import MarkerGeometryError
 from specimap.core.geometry import Floats, Intrinsics, Pose, fit_similarity
 from specimap.core.reconstruct.markers import MarkerSolution, solve_from_markers
-from specimap.core.reconstruct.squares import square_poses
+from specimap.core.reconstruct.squares import two_poses
 from specimap.core.solver import MarkerScene, Observations, corners_of, rms_px, solve, square_corners
 
 SIZE = (640, 480)
@@ -94,7 +94,7 @@ def test_a_photo_with_one_marker_is_not_flipped() -> None:
 def test_the_two_poses_of_a_square_hold_the_true_one() -> None:
     truth, seen = marker_scene(noise_px=0.0, seed=8)
     for k in range(12):
-        options = square_poses(seen.corners_px[k], truth.lens, EDGE_MM)
+        options = two_poses(seen.corners_px[k : k + 1], truth.lens, EDGE_MM)[0]
         assert len(options) == 2
         assert truth.squares is not None
         true = truth.poses[seen.photo[k]] @ truth.squares[seen.marker[k]]

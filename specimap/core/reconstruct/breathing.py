@@ -8,6 +8,7 @@ the distance makes it good.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
@@ -52,7 +53,7 @@ class Breathing:
 
 
 def settle_breathing(
-    photos: list[Photo], corners: CornersInPhotos, *, edge_mm: float, focal_px: float | None
+    photos: list[Photo], corners: CornersInPhotos, *, edge_mm: float, focal_px: float | None, workers: int = 2
 ) -> tuple[list[Photo], CornersInPhotos, Floats]:
     """Photos and corners as one shared lens would have seen them, with the zooms (P,) that were taken out.
 
@@ -75,7 +76,9 @@ def settle_breathing(
         seen = bring_to_shared(corners.seen, zooms, photos[0].size)
     if (zooms == 1).all():
         return photos, corners, zooms
-    steady = [replace(p, image=image_at_shared(p.image, float(z))) for p, z in zip(photos, zooms, strict=True)]
+    with ThreadPoolExecutor(workers) as pool:
+        images = pool.map(image_at_shared, (p.image for p in photos), zooms.tolist())
+        steady = [replace(p, image=image) for p, image in zip(photos, images, strict=True)]
     return steady, replace(corners, seen=seen, solution=None), zooms
 
 
@@ -159,4 +162,7 @@ def image_at_shared(image: NDArray[np.uint8], zoom: float) -> NDArray[np.uint8]:
     light = cv2.warpAffine(
         linear_from_srgb(image), from_shared, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
     )
-    return np.asarray(255 * srgb_from_linear(light) + 0.5, np.uint8)
+    encoded = srgb_from_linear(light)
+    encoded *= 255
+    encoded += 0.5
+    return encoded.astype(np.uint8)

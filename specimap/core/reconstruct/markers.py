@@ -19,7 +19,6 @@ from specimap.core.reconstruct.squares import (
     largest_consensus,
     medoid,
     required,
-    square_poses,
     two_poses,
 )
 from specimap.core.solver import MarkerScene, Observations, SolveInfo, corners_of, solve
@@ -101,7 +100,7 @@ def _solve_agreed(
     limit_px: float,
 ) -> MarkerSolution | None:
     """The solution from the photos that share one layout of markers; None where that leaves too few."""
-    picked = agreeing_poses(seen, two_poses(seen, lens, edge_mm))
+    picked = agreeing_poses(seen, two_poses(seen.corners_px, lens, edge_mm))
     contradict = largest_consensus(seen, picked, lens, edge_mm, limit_px)
     keep = ~np.isin(seen.photo, list(contradict))
     if not contradict or len(np.unique(seen.photo[keep])) < LEAST_AGREEING:
@@ -117,7 +116,7 @@ def _solve_start(
     edge_mm: float,
     focal_prior: float | None,
 ) -> MarkerSolution:
-    picked = agreeing_poses(seen, two_poses(seen, lens, edge_mm))
+    picked = agreeing_poses(seen, two_poses(seen.corners_px, lens, edge_mm))
     poses, squares, lost = _chain(seen, picked, len(marker_ids))
     seen = seen.of(np.isin(seen.photo, list(poses)))
     photos, markers = tuple(sorted(poses)), tuple(sorted(squares))
@@ -229,17 +228,15 @@ def _unflip(
     assert scene.squares is not None
     poses = list(scene.poses)
     weak: dict[int, Pose] = {}
+    choices = two_poses(seen.corners_px, scene.lens, edge_mm)
+    back = [square.inverse() for square in scene.squares]
     for p in range(len(poses)):
+        rows = np.flatnonzero(seen.photo == p)
         mine = seen.of(seen.photo == p)
-        world = scene.corners[mine.marker]
-        options = [poses[p]]
-        for corners_px, marker in zip(mine.corners_px, mine.marker, strict=True):
-            inverse = scene.squares[int(marker)].inverse()
-            options += [pose @ inverse for pose, _ in square_poses(corners_px, scene.lens, edge_mm)]
-        costs = []
-        for option in options:
-            miss = scene.lens.project(option.apply(world)) - mine.corners_px
-            costs.append(float(np.median(np.sqrt((miss**2).sum(-1)))) if np.isfinite(miss).all() else np.inf)
+        options = [poses[p], *(pose @ back[int(seen.marker[k])] for k in rows for pose, _ in choices[k])]
+        cam = np.stack([option.apply(scene.corners[mine.marker]) for option in options])
+        miss = np.linalg.norm(scene.lens.project(cam) - mine.corners_px, axis=-1).reshape(len(options), -1)
+        costs = np.where(np.isfinite(miss).all(1), np.median(miss, axis=1), np.inf)
         best = int(np.argmin(costs))
         if costs[best] < 0.9 * costs[0]:
             poses[p] = options[best]
