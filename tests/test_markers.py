@@ -142,6 +142,25 @@ def test_one_wrong_marker_reading_is_left_out() -> None:
     assert corner_errors(solution.scene, truth.corners).max() < 0.1
 
 
+def test_an_earlier_solution_leads_to_the_same_answer() -> None:
+    """Corners that moved a little, and a photo and a marker that the earlier solution does not know."""
+    truth, seen = marker_scene(seed=4)
+    earlier = solved(seen.of((seen.photo != 6) & (seen.marker != 2)), (0, 1, 2, 3))
+    assert 6 not in earlier.photos
+    assert earlier.markers == (0, 1, 3)
+    shift = np.random.default_rng(5).normal(0, 0.1, seen.corners_px.shape)
+    later = replace(seen, corners_px=seen.corners_px + shift)
+    anew = solved(later, (0, 1, 2, 3))
+    onward = solve_from_markers(later, (0, 1, 2, 3), SIZE, edge_mm=EDGE_MM, start=earlier)
+    assert onward.photos == anew.photos == tuple(range(10))
+    assert onward.markers == anew.markers == (0, 1, 2, 3)
+    assert not onward.foreign
+    assert np.isclose(onward.info.cost, anew.info.cost, rtol=1e-4)
+    assert np.isclose(onward.scene.lens.focal_px, anew.scene.lens.focal_px, rtol=1e-4)
+    assert 1e-4 < corner_errors(onward.scene, truth.corners).max() < 0.1
+    assert corner_errors(onward.scene, anew.scene.corners).max() < 1e-3
+
+
 def test_nonsense_is_refused() -> None:
     _, seen = marker_scene(seed=15)
     rng = np.random.default_rng(0)
