@@ -22,7 +22,7 @@ from specimap.core.reconstruct.breathing import (
     settle_breathing,
 )
 from specimap.core.reconstruct.markers import solve_from_markers
-from specimap.core.solver import Observations
+from specimap.core.solver import Observations, rms_px
 
 SPREAD = 0.01
 BREATHING_SEEDS = (21, 22)
@@ -207,6 +207,10 @@ def test_photos_and_corners_are_brought_by_the_zooms_returned() -> None:
     assert np.array_equal(corners.seen.corners_px, again.corners_px)
     back = bring_to_shared(corners.seen, 1 / zooms, photos[0].size)
     assert back.corners_px == pytest.approx(scene.corners.seen.corners_px, abs=1e-9)
+    solution = corners.solution
+    assert solution is not None
+    assert np.isin(solution.seen.corners_px, corners.seen.corners_px).all()
+    assert 0.01 < rms_px(solution.scene.residuals(solution.seen)) < 0.3
 
 
 def test_the_middle_stays_and_a_zoom_too_small_to_see_moves_nothing() -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from specimap.core.acquisition import AcquisitionSettings, Photo, read_photo
 from specimap.core.colour import linear_from_srgb, srgb_from_linear
+from specimap.core.edges import refine_corners
 from specimap.core.errors import (
     DuplicateMarkersError,
     NoMarkersFoundError,
@@ -112,6 +113,34 @@ def test_the_stated_sigma_is_of_the_errors_size() -> None:
             sigmas.append(d.sigma_px)
     ratio = float(np.std(errors)) / float(np.median(sigmas))
     assert 0.3 < ratio < 3.0
+
+
+def test_squares_of_all_sizes_are_measured_together_as_alone() -> None:
+    """Profiles of different lengths stand beside each other; what pads the short ones must not count."""
+    places = {0: square(40.3, 50.7, 17.2, 12), 1: square(120.6, 60.1, 38.5, -33), 2: square(270.2, 170.4, 150.9, 61)}
+    light = linear_from_srgb(picture(places, noise=0.5))
+    truth = np.stack(list(places.values()))
+    start = truth + np.random.default_rng(1).uniform(-0.4, 0.4, truth.shape)
+    together, sigmas = refine_corners(light, start)
+    distance = np.linalg.norm(together - truth, axis=-1)
+    assert distance.min() > 0.001
+    assert distance.max() < 0.15
+    for k in range(len(truth)):
+        alone, sigma = refine_corners(light, start[k : k + 1])
+        assert np.allclose(alone[0], together[k], atol=1e-9)
+        assert sigma[0] == pytest.approx(sigmas[k])
+        assert 0.005 < sigma[0] < 0.1
+
+
+def test_a_square_without_edges_keeps_its_corners() -> None:
+    places = {0: square(80.3, 70.7, 41.2, 12)}
+    light = linear_from_srgb(picture(places))
+    outside = places[0] - places[0].min(0) + [402.0, 120.0]
+    blank = np.zeros_like(light)
+    for image, start in ((light, outside), (blank, places[0])):
+        corners, sigma = refine_corners(image, start[None])
+        assert np.allclose(corners[0], start, atol=1e-9)
+        assert 0.5 <= sigma[0] < 1
 
 
 def test_a_defocused_marker_is_found_by_the_second_search() -> None:

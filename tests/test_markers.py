@@ -11,7 +11,7 @@ from scenes import EDGE_MM, marker_scene, rotation_deg
 from specimap.core.errors import MarkerGeometryError
 from specimap.core.geometry import Floats, Intrinsics, Pose, fit_similarity
 from specimap.core.reconstruct.markers import MarkerSolution, solve_from_markers
-from specimap.core.reconstruct.squares import square_poses
+from specimap.core.reconstruct.squares import two_poses
 from specimap.core.solver import MarkerScene, Observations, corners_of, rms_px, solve, square_corners
 
 SIZE = (640, 480)
@@ -94,7 +94,7 @@ def test_a_photo_with_one_marker_is_not_flipped() -> None:
 def test_the_two_poses_of_a_square_hold_the_true_one() -> None:
     truth, seen = marker_scene(noise_px=0.0, seed=8)
     for k in range(12):
-        options = square_poses(seen.corners_px[k], truth.lens, EDGE_MM)
+        options = two_poses(seen.corners_px[k : k + 1], truth.lens, EDGE_MM)[0]
         assert len(options) == 2
         assert truth.squares is not None
         true = truth.poses[seen.photo[k]] @ truth.squares[seen.marker[k]]
@@ -140,6 +140,25 @@ def test_one_wrong_marker_reading_is_left_out() -> None:
     solution = solved(replace(seen, corners_px=corners), (0, 1, 2, 3))
     assert len(solution.seen.photo) == len(seen.photo) - 1
     assert corner_errors(solution.scene, truth.corners).max() < 0.1
+
+
+def test_an_earlier_solution_leads_to_the_same_answer() -> None:
+    """Corners that moved a little, and a photo and a marker that the earlier solution does not know."""
+    truth, seen = marker_scene(seed=4)
+    earlier = solved(seen.of((seen.photo != 6) & (seen.marker != 2)), (0, 1, 2, 3))
+    assert 6 not in earlier.photos
+    assert earlier.markers == (0, 1, 3)
+    shift = np.random.default_rng(5).normal(0, 0.1, seen.corners_px.shape)
+    later = replace(seen, corners_px=seen.corners_px + shift)
+    anew = solved(later, (0, 1, 2, 3))
+    onward = solve_from_markers(later, (0, 1, 2, 3), SIZE, edge_mm=EDGE_MM, start=earlier)
+    assert onward.photos == anew.photos == tuple(range(10))
+    assert onward.markers == anew.markers == (0, 1, 2, 3)
+    assert not onward.foreign
+    assert np.isclose(onward.info.cost, anew.info.cost, rtol=1e-4)
+    assert np.isclose(onward.scene.lens.focal_px, anew.scene.lens.focal_px, rtol=1e-4)
+    assert 1e-4 < corner_errors(onward.scene, truth.corners).max() < 0.1
+    assert corner_errors(onward.scene, anew.scene.corners).max() < 1e-3
 
 
 def test_nonsense_is_refused() -> None:

@@ -138,9 +138,10 @@ def read_photo(path: Path, settings: AcquisitionSettings) -> Photo:
             exif = opened.getexif()
             # A JPEG decodes straight to a half or a quarter of its size where that is still large enough.
             opened.draft("RGB", (settings.working_px, settings.working_px))
-            upright = ImageOps.exif_transpose(opened)
-            image = _eight_bit(upright)
             details = exif.get_ifd(ExifTags.IFD.Exif)
+            turns = QUARTER_TURNS.get(exif.get(ExifTags.Base.Orientation, 1), 0)
+            ImageOps.exif_transpose(opened, in_place=True)
+            image = _eight_bit(opened)
     except PhotoUnreadableError:
         raise
     except Exception as error:
@@ -150,7 +151,6 @@ def read_photo(path: Path, settings: AcquisitionSettings) -> Photo:
             advice="Copy the photo from the phone again, or take it again.",
             photo=path.name,
         ) from error
-    turns = QUARTER_TURNS.get(exif.get(ExifTags.Base.Orientation, 1), 0)
     if turns % 2:
         width, height = height, width
     longer = max(image.shape[:2])
@@ -177,7 +177,7 @@ def _eight_bit(image: Image.Image) -> NDArray[np.uint8]:
         top = 65535.0 if values.max() > 255 else 255.0
         grey = np.clip(values / top * 255, 0, 255).astype(np.uint8)
         return np.repeat(grey[..., None], 3, axis=2)
-    return np.asarray(image.convert("RGB"), np.uint8)
+    return np.asarray(image if image.mode == "RGB" else image.convert("RGB"), np.uint8)
 
 
 def _focal_px(details: dict[int, object], width: int, height: int) -> float | None:

@@ -64,21 +64,16 @@ class Adjusted:
 
 def triangulate(lens: Intrinsics, poses: tuple[Pose, ...], seen: Observations, count: int) -> Floats:
     """Corners (count, 4, 3) nearest to their rays, in the frame of ``poses``; NaN for fewer than two rays."""
+    R, centres = (np.stack(x)[seen.photo] for x in ([p.R for p in poses], [p.centre for p in poses]))
+    d = lens.rays(seen.corners_px) @ R
+    d = d / np.linalg.norm(d, axis=-1, keepdims=True)
+    across = np.eye(3) - d[..., :, None] * d[..., None, :]
+    A, b = np.zeros((count, 4, 3, 3)), np.zeros((count, 4, 3))
+    np.add.at(A, seen.marker, across)
+    np.add.at(b, seen.marker, (across @ centres[:, None, :, None])[..., 0])
     corners = np.full((count, 4, 3), np.nan)
-    for m in range(count):
-        rows = np.flatnonzero(seen.marker == m)
-        if len(rows) < 2:
-            continue
-        for c in range(4):
-            A, b = np.zeros((3, 3)), np.zeros(3)
-            for k in rows:
-                pose = poses[int(seen.photo[k])]
-                d = pose.R.T @ lens.rays(seen.corners_px[k, c])
-                d = d / np.linalg.norm(d)
-                across = np.eye(3) - np.outer(d, d)
-                A += across
-                b += across @ pose.centre
-            corners[m, c] = np.linalg.solve(A, b)
+    shared = np.bincount(seen.marker, minlength=count) >= 2
+    corners[shared] = np.linalg.solve(A[shared], b[shared][..., None])[..., 0]
     return corners
 
 

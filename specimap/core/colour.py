@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,12 +19,16 @@ def _linear_bytes() -> Singles:
 
 def linear_from_srgb(image: NDArray[np.uint8]) -> Singles:
     """sRGB bytes to linear light in 0..1, same shape."""
-    return np.asarray(_linear_bytes()[image])
+    linear = np.empty(image.shape, np.float32)
+    if image.size:  # of nothing OpenCV makes nothing, not an empty array
+        cv2.LUT(image.reshape(-1, 1), _linear_bytes(), linear.reshape(-1, 1))
+    return linear
 
 
 def srgb_from_linear(linear: Singles) -> Singles:
     """Linear light to sRGB's encoding, both 0..1; values outside are clipped."""
     x = np.clip(linear, 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4, dtype=np.float32) - 0.055).astype(
-        np.float32
-    )
+    encoded = np.power(x, 1 / 2.4, dtype=np.float32)
+    encoded *= 1.055
+    encoded -= 0.055
+    return np.asarray(np.multiply(x, 12.92, out=encoded, where=x <= 0.0031308))

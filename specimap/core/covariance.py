@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from specimap.core.geometry import Floats, skew
-from specimap.core.solver import LENS, MarkerScene, SolveInfo
+from specimap.core.projection import LENS
+from specimap.core.solver import MarkerScene, SolveInfo
 
 
 def corner_covariance(scene: MarkerScene, info: SolveInfo) -> Floats:

@@ -2,8 +2,8 @@
 
 Unknowns: a shared lens (focal length, principal point, two radial terms), a pose per photo, and the markers,
 either rigid squares of known edge (a pose each) or four free points each. Derivatives are analytic; the normal
-equations are dense, since a marker is seen by most photos. Robustness is by reweighting (Huber 1964 on whole
-markers' corners); Levenberg-Marquardt damping also takes care of the free choice of frame.
+equations (:mod:`specimap.core.normal`) are solved for lens and markers first. Robustness is by reweighting (Huber
+1964 on whole markers' corners); Levenberg-Marquardt damping also takes care of the free choice of frame.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specimap.core.geometry import Floats, Intrinsics, Pose, rotation_from_vector, skew
+from specimap.core.normal import Assembly, damped_step
+from specimap.core.projection import LENS, projection_derivatives
 from specimap.core.robust import MEDIAN_OF_RAYLEIGH
 
 Ints = NDArray[np.int64]
 
-LENS = 5  # log focal length, cx, cy, k1, k2
 PRIOR_FOCAL = 0.05
 """Standard deviation of the logarithm of a focal length that EXIF states."""
 PRIOR_CENTRE = 0.003
@@ -113,7 +114,7 @@ def solve(
     before = rms_px(scene.residuals(seen))
     prior_focal = focal_prior_px or scene.lens.focal_px
     focal_sd = PRIOR_FOCAL if focal_prior_px else 10.0
-    given, steps = seen, 0
+    given, steps, assembly = seen, 0, _assembly(scene, seen)
     for _ in range(NOISE_ROUNDS if robust else 1):
         # What the corners scatter by beyond their own sigma (an uneven print, a lens that two terms do not
         # describe) is noise all the same; unless it is counted, the priors have no say.
@@ -121,7 +122,7 @@ def solve(
         excess = max(1.0, float(np.median(norm)) / MEDIAN_OF_RAYLEIGH)
         seen = replace(given, sigma_px=given.sigma_px * excess)
         system = partial(
-            _normal_equations, seen=seen, edge_mm=edge_mm, refine_lens=refine_lens, robust=robust,
+            _normal_equations, seen=seen, assembly=assembly, edge_mm=edge_mm, refine_lens=refine_lens, robust=robust,
             prior_focal=prior_focal, focal_sd=focal_sd,
         )  # fmt: skip
         scene, taken, (H, _, cost, weights) = _descend(scene, system, edge_mm, refine_lens, iterations)
@@ -145,7 +146,7 @@ def _descend(
     current = system(scene)
     for taken in range(1, iterations + 1):  # noqa: B007
         H, g, cost, _ = current
-        step: Floats = np.asarray(np.linalg.solve(H + np.diag(damping * np.diag(H) + 1e-12), -g), float)
+        step = damped_step(H, g, damping, (LENS, len(scene.poses), 6))
         if not np.isfinite(step).all():
             break
         moved = _apply(scene, step, edge_mm, refine_lens)
@@ -162,9 +163,25 @@ def _descend(
     return scene, taken, current
 
 
+def _marker_size(scene: MarkerScene) -> int:
+    return 12 if scene.squares is None else 6
+
+
+def _assembly(scene: MarkerScene, seen: Observations) -> Assembly:
+    """Unknowns: lens | photos (6 each) | markers."""
+    size, markers = _marker_size(scene), LENS + 6 * len(scene.poses)
+    parts = (
+        np.tile(np.arange(LENS), (len(seen.photo), 1)),
+        LENS + 6 * seen.photo[:, None] + np.arange(6),
+        markers + size * seen.marker[:, None] + np.arange(size),
+    )
+    return Assembly(np.concatenate(parts, axis=1), markers + size * len(scene.corners))
+
+
 def _normal_equations(
     scene: MarkerScene,
     seen: Observations,
+    assembly: Assembly,
     edge_mm: float,
     refine_lens: bool,
     robust: bool,
@@ -173,26 +190,24 @@ def _normal_equations(
 ) -> System:
     """Normal matrix, gradient, robust cost, and mean weight (M,) of each observation."""
     lens, poses = scene.lens, scene.poses
-    P, Q = len(poses), len(scene.corners)
-    size = 12 if scene.squares is None else 6
-    M = len(seen.photo)
+    M, size = len(seen.photo), _marker_size(scene)
     Rp = np.stack([p.R for p in poses])[seen.photo]
     tp = np.stack([p.t for p in poses])[seen.photo]
     X = scene.corners[seen.marker]
-    turned = np.einsum("mij,mcj->mci", Rp, X)
+    turned = X @ Rp.transpose(0, 2, 1)
     cam = turned + tp[:, None]
-    residual, d_cam, d_lens = _projection(lens, cam, seen.corners_px)
+    residual, d_cam, d_lens = projection_derivatives(lens, cam, seen.corners_px)
     sigma = seen.sigma_px[:, None, None]
     # per observation: 8 rows; columns lens | photo (6) | marker (size)
     J_photo = np.concatenate([-d_cam @ skew(turned), d_cam], -1)  # left perturbation of the rotation
-    d_point = np.einsum("mcij,mjk->mcik", d_cam, Rp)
+    d_point = d_cam @ Rp[:, None]
     if scene.squares is None:
         J_marker = np.zeros((M, 4, 2, 12))
         for c in range(4):
             J_marker[:, c, :, 3 * c : 3 * c + 3] = d_point[:, c]
     else:
         Rm = np.stack([s.R for s in scene.squares])[seen.marker]
-        arm = np.einsum("mij,cj->mci", Rm, square_corners(edge_mm))
+        arm = square_corners(edge_mm) @ Rm.transpose(0, 2, 1)
         J_marker = np.concatenate([-d_point @ skew(arm), d_point], -1)
     norm = np.sqrt((residual**2).sum(-1)) / sigma[..., 0]
     weights = np.minimum(1.0, HUBER / np.maximum(norm, 1e-12)) if robust else np.ones_like(norm)
@@ -202,22 +217,7 @@ def _normal_equations(
     Jl = (d_lens * root[..., None]).reshape(M, 8, LENS)
     Jp = (J_photo * root[..., None]).reshape(M, 8, 6)
     Jm = (J_marker * root[..., None]).reshape(M, 8, size)
-    offset_m = LENS + 6 * P
-    n = offset_m + size * Q
-    J = np.concatenate([Jl, Jp, Jm], -1)
-    blocks = np.einsum("mri,mrj->mij", J, J)
-    gradient = np.einsum("mri,mr->mi", J, r)
-    columns = np.concatenate(
-        [
-            np.tile(np.arange(LENS), (M, 1)),
-            LENS + 6 * seen.photo[:, None] + np.arange(6),
-            offset_m + size * seen.marker[:, None] + np.arange(size),
-        ],
-        axis=1,
-    )
-    flat = columns[:, :, None] * n + columns[:, None, :]
-    H = np.asarray(np.bincount(flat.ravel(), blocks.ravel(), n * n), float).reshape(n, n)
-    g = np.asarray(np.bincount(columns.ravel(), gradient.ravel(), n), float)
+    H, g = assembly(np.concatenate([Jl, Jp, Jm], -1), r)
     deviation = np.array(
         [
             np.log(lens.focal_px / prior_focal),
@@ -238,34 +238,10 @@ def _normal_equations(
     return H, g, cost, weights.mean(1)
 
 
-def _projection(lens: Intrinsics, cam: Floats, measured: Floats) -> tuple[Floats, Floats, Floats]:
-    """Residual (M, 4, 2), its derivative by the camera point (M, 4, 2, 3) and by the lens (M, 4, 2, 5)."""
-    z = np.where(np.abs(cam[..., 2]) < 1e-6, 1e-6, cam[..., 2])
-    xy = cam[..., :2] / z[..., None]
-    r2 = (xy * xy).sum(-1)
-    radial = 1 + r2 * (lens.k1 + r2 * lens.k2)
-    f = lens.focal_px
-    offset = f * xy * radial[..., None]
-    residual = offset + np.array([lens.cx, lens.cy]) - measured
-    d_xy = f * (
-        radial[..., None, None] * np.eye(2)
-        + 2 * (lens.k1 + 2 * lens.k2 * r2)[..., None, None] * xy[..., :, None] * xy[..., None, :]
-    )
-    d_cam = np.zeros((*xy.shape, 3))
-    d_cam[..., :2] = d_xy / z[..., None, None]
-    d_cam[..., 2] = -(d_xy @ xy[..., None])[..., 0] / z[..., None]
-    d_lens = np.zeros((*xy.shape, LENS))
-    d_lens[..., 0] = offset
-    d_lens[..., 0, 1] = d_lens[..., 1, 2] = 1
-    d_lens[..., 3] = f * xy * r2[..., None]
-    d_lens[..., 4] = f * xy * (r2**2)[..., None]
-    return residual, d_cam, d_lens
-
-
-def _turn(pose: Pose, step: Floats) -> Pose:
-    R = rotation_from_vector(step[:3]) @ pose.R
-    u, _, vt = np.linalg.svd(R)
-    return Pose(u @ vt, pose.t + step[3:])
+def _moved(poses: tuple[Pose, ...], steps: Floats) -> tuple[Pose, ...]:
+    """Poses turned from the left and shifted by ``steps`` (N, 6)."""
+    u, _, vt = np.linalg.svd(rotation_from_vector(steps[:, :3]) @ np.stack([p.R for p in poses]))
+    return tuple(Pose(R, p.t + t) for R, p, t in zip(u @ vt, poses, steps[:, 3:], strict=True))
 
 
 def _apply(scene: MarkerScene, step: Floats, edge_mm: float, refine_lens: bool) -> MarkerScene:
@@ -280,12 +256,11 @@ def _apply(scene: MarkerScene, step: Floats, edge_mm: float, refine_lens: bool) 
             k2=lens.k2 + float(step[4]),
         )
     P = len(scene.poses)
-    photo_steps = step[LENS : LENS + 6 * P].reshape(P, 6)
-    poses = tuple(_turn(p, s) for p, s in zip(scene.poses, photo_steps, strict=True))
+    poses = _moved(scene.poses, step[LENS : LENS + 6 * P].reshape(P, 6))
     rest = step[LENS + 6 * P :]
     if scene.squares is None:
         return MarkerScene(lens, poses, scene.corners + rest.reshape(-1, 4, 3), None)
-    squares = tuple(_turn(s, d) for s, d in zip(scene.squares, rest.reshape(-1, 6), strict=True))
+    squares = _moved(scene.squares, rest.reshape(-1, 6))
     return MarkerScene(lens, poses, corners_of(squares, edge_mm), squares)
 
 

@@ -84,7 +84,7 @@ def reconstruct_stage(
         )
         corners = corners_in_photos(photos, detections, settings.reconstruct.dictionary)
         photos, corners, zooms = settle_breathing(
-            photos, corners, edge_mm=settings.adjust.edge_mm, focal_px=stated_focal_px(photos)
+            photos, corners, edge_mm=settings.adjust.edge_mm, focal_px=stated_focal_px(photos), workers=workers
         )
         reconstruction = backend.reconstruct(
             photos,

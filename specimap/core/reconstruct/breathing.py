@@ -8,6 +8,7 @@ the distance makes it good.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
@@ -19,7 +20,7 @@ from specimap.core.colour import linear_from_srgb, srgb_from_linear
 from specimap.core.errors import SpecimapError
 from specimap.core.geometry import Floats, Intrinsics, Pose, rotation_from_vector, skew
 from specimap.core.reconstruct.backend import CornersInPhotos
-from specimap.core.reconstruct.markers import solve_from_markers
+from specimap.core.reconstruct.markers import MarkerSolution, solve_from_markers
 from specimap.core.robust import MEDIAN_OF_RAYLEIGH
 from specimap.core.solver import HUBER, MarkerScene, Observations
 
@@ -52,7 +53,7 @@ class Breathing:
 
 
 def settle_breathing(
-    photos: list[Photo], corners: CornersInPhotos, *, edge_mm: float, focal_px: float | None
+    photos: list[Photo], corners: CornersInPhotos, *, edge_mm: float, focal_px: float | None, workers: int = 2
 ) -> tuple[list[Photo], CornersInPhotos, Floats]:
     """Photos and corners as one shared lens would have seen them, with the zooms (P,) that were taken out.
 
@@ -60,23 +61,28 @@ def settle_breathing(
     explains, or where the markers alone do not solve.
     """
     zooms, seen = np.ones(len(photos)), corners.seen
-    for turn in range(SETTLING):
+    solution: MarkerSolution | None = None
+    for turn in range(SETTLING + 1):
         try:
             solution = solve_from_markers(
-                seen, corners.marker_ids, photos[0].size, edge_mm=edge_mm, focal_px=focal_px
+                seen, corners.marker_ids, photos[0].size, edge_mm=edge_mm, focal_px=focal_px, start=solution
             )
         except SpecimapError:
+            solution = None
             break
-        found = estimate_breathing(solution.scene, solution.seen)
+        # The last solution is of the corners as they are handed on.
+        found = estimate_breathing(solution.scene, solution.seen) if turn < SETTLING else None
         if found is None or (turn == 0 and found.significance < SIGNIFICANT):
-            corners = replace(corners, solution=solution)
             break
         zooms[list(solution.photos)] *= found.zooms
         seen = bring_to_shared(corners.seen, zooms, photos[0].size)
+    corners = replace(corners, seen=seen, solution=solution)
     if (zooms == 1).all():
         return photos, corners, zooms
-    steady = [replace(p, image=image_at_shared(p.image, float(z))) for p, z in zip(photos, zooms, strict=True)]
-    return steady, replace(corners, seen=seen, solution=None), zooms
+    with ThreadPoolExecutor(workers) as pool:
+        images = pool.map(image_at_shared, (p.image for p in photos), zooms.tolist())
+        steady = [replace(p, image=image) for p, image in zip(photos, images, strict=True)]
+    return steady, corners, zooms
 
 
 def estimate_breathing(scene: MarkerScene, seen: Observations) -> Breathing | None:
@@ -159,4 +165,7 @@ def image_at_shared(image: NDArray[np.uint8], zoom: float) -> NDArray[np.uint8]:
     light = cv2.warpAffine(
         linear_from_srgb(image), from_shared, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
     )
-    return np.asarray(255 * srgb_from_linear(light) + 0.5, np.uint8)
+    encoded = srgb_from_linear(light)
+    encoded *= 255
+    encoded += 0.5
+    return encoded.astype(np.uint8)

@@ -19,7 +19,6 @@ from specimap.core.reconstruct.squares import (
     largest_consensus,
     medoid,
     required,
-    square_poses,
     two_poses,
 )
 from specimap.core.solver import MarkerScene, Observations, SolveInfo, corners_of, solve
@@ -59,6 +58,7 @@ def solve_from_markers(
     *,
     edge_mm: float,
     focal_px: float | None = None,
+    start: MarkerSolution | None = None,
 ) -> MarkerSolution:
     """Pose all photos that show a marker, without calibration.
 
@@ -66,15 +66,16 @@ def solve_from_markers(
         seen: ``photo`` indexes the caller's photos; ``marker`` indexes ``marker_ids``.
         size: width, height of the photos in pixels.
         focal_px: from EXIF, where there is one; used as a start and a weak prior.
+        start: what nearly the same corners were solved to; what it places need not be looked for again.
 
     Raises:
         MarkerGeometryError: no start leads to a consistent set of cameras.
     """
     longer = max(size)
-    starts = [focal_px] if focal_px else [s * longer for s in FOCAL_STARTS]
-    lenses = [Intrinsics.centred(*size, start) for start in starts]
+    focals = [focal_px] if focal_px else [s * longer for s in FOCAL_STARTS]
+    lenses = [start.scene.lens] if start else [Intrinsics.centred(*size, focal) for focal in focals]
     limit = max(OUTLIER_PX, 0.004 * longer)
-    best = min((_solve_start(seen, marker_ids, lens, edge_mm, focal_px) for lens in lenses), key=_rank)
+    best = min((_solve_start(seen, marker_ids, lens, edge_mm, focal_px, start) for lens in lenses), key=_rank)
     if best.info.rms_after_px > limit or best.foreign:
         # A layout averaged over two scenes fits neither: find the one that most photos share.
         agreed = [_solve_agreed(seen, marker_ids, lens, edge_mm, focal_px, limit) for lens in lenses]
@@ -101,7 +102,7 @@ def _solve_agreed(
     limit_px: float,
 ) -> MarkerSolution | None:
     """The solution from the photos that share one layout of markers; None where that leaves too few."""
-    picked = agreeing_poses(seen, two_poses(seen, lens, edge_mm))
+    picked = agreeing_poses(seen, two_poses(seen.corners_px, lens, edge_mm))
     contradict = largest_consensus(seen, picked, lens, edge_mm, limit_px)
     keep = ~np.isin(seen.photo, list(contradict))
     if not contradict or len(np.unique(seen.photo[keep])) < LEAST_AGREEING:
@@ -116,9 +117,11 @@ def _solve_start(
     lens: Intrinsics,
     edge_mm: float,
     focal_prior: float | None,
+    start: MarkerSolution | None = None,
 ) -> MarkerSolution:
-    picked = agreeing_poses(seen, two_poses(seen, lens, edge_mm))
-    poses, squares, lost = _chain(seen, picked, len(marker_ids))
+    picked = agreeing_poses(seen, two_poses(seen.corners_px, lens, edge_mm))
+    poses, squares = _placed(start, marker_ids) if start else ({}, _most_seen(seen))
+    lost = _chain(seen, picked, poses, squares)
     seen = seen.of(np.isin(seen.photo, list(poses)))
     photos, markers = tuple(sorted(poses)), tuple(sorted(squares))
     inner = _reindexed(seen, photos, markers)
@@ -187,20 +190,39 @@ def _reindexed(seen: Observations, photos: tuple[int, ...], markers: tuple[int, 
     )
 
 
-def _chain(
-    seen: Observations, picked: list[Pose | None], marker_count: int
-) -> tuple[dict[int, Pose], dict[int, Pose], tuple[int, ...]]:
-    """Walk from the marker seen most over the photos to all others; averages are left to the least squares.
+def _most_seen(seen: Observations) -> dict[int, Pose]:
+    """The marker seen most, at the origin."""
+    return {int(np.bincount(seen.marker).argmax()): Pose(np.eye(3), np.zeros(3))}
 
-    Returns poses of photos, poses of markers, and the photos that the walk does not reach.
+
+def _placed(solution: MarkerSolution, marker_ids: tuple[int, ...]) -> tuple[dict[int, Pose], dict[int, Pose]]:
+    """Poses of the photos and of the markers of a solution, the latter by their place in ``marker_ids``."""
+    squares = zip(solution.markers, solution.scene.squares or (), strict=True)
+    return (
+        dict(zip(solution.photos, solution.scene.poses, strict=True)),
+        {marker_ids.index(marker): square for marker, square in squares},
+    )
+
+
+def _chain(
+    seen: Observations, picked: list[Pose | None], poses: dict[int, Pose], squares: dict[int, Pose]
+) -> tuple[int, ...]:
+    """Walk from the photos and markers posed so far to all others; averages are left to the least squares.
+
+    Adds to ``poses`` of photos and ``squares`` of markers. Returns the photos that the walk does not reach.
     """
     by_photo: dict[int, list[int]] = defaultdict(list)
     for k, photo in enumerate(seen.photo):
         if picked[k] is not None:
             by_photo[int(photo)].append(k)
-    counts = np.bincount(seen.marker, minlength=marker_count)
-    squares = {int(counts.argmax()): Pose(np.eye(3), np.zeros(3))}
-    poses: dict[int, Pose] = {}
+
+    def place_markers(photo: int) -> None:
+        for k in by_photo[photo]:
+            if int(seen.marker[k]) not in squares:
+                squares[int(seen.marker[k])] = poses[photo].inverse() @ required(picked[k])
+
+    for photo in poses:
+        place_markers(photo)
     while True:
         reachable = [
             (sum(int(seen.marker[k]) in squares for k in rows), len(rows), photo)
@@ -211,12 +233,9 @@ def _chain(
             break
         _, _, photo = max(reachable)
         known = [k for k in by_photo[photo] if int(seen.marker[k]) in squares]
-        candidates = [required(picked[k]) @ squares[int(seen.marker[k])].inverse() for k in known]
-        pose = medoid(candidates)
-        poses[photo] = pose
-        for k in by_photo[photo]:
-            squares.setdefault(int(seen.marker[k]), pose.inverse() @ required(picked[k]))
-    return poses, squares, tuple(sorted(set(by_photo) - set(poses)))
+        poses[photo] = medoid([required(picked[k]) @ squares[int(seen.marker[k])].inverse() for k in known])
+        place_markers(photo)
+    return tuple(sorted(set(by_photo) - set(poses)))
 
 
 def _unflip(
@@ -229,17 +248,15 @@ def _unflip(
     assert scene.squares is not None
     poses = list(scene.poses)
     weak: dict[int, Pose] = {}
+    choices = two_poses(seen.corners_px, scene.lens, edge_mm)
+    back = [square.inverse() for square in scene.squares]
     for p in range(len(poses)):
+        rows = np.flatnonzero(seen.photo == p)
         mine = seen.of(seen.photo == p)
-        world = scene.corners[mine.marker]
-        options = [poses[p]]
-        for corners_px, marker in zip(mine.corners_px, mine.marker, strict=True):
-            inverse = scene.squares[int(marker)].inverse()
-            options += [pose @ inverse for pose, _ in square_poses(corners_px, scene.lens, edge_mm)]
-        costs = []
-        for option in options:
-            miss = scene.lens.project(option.apply(world)) - mine.corners_px
-            costs.append(float(np.median(np.sqrt((miss**2).sum(-1)))) if np.isfinite(miss).all() else np.inf)
+        options = [poses[p], *(pose @ back[int(seen.marker[k])] for k in rows for pose, _ in choices[k])]
+        cam = np.stack([option.apply(scene.corners[mine.marker]) for option in options])
+        miss = np.linalg.norm(scene.lens.project(cam) - mine.corners_px, axis=-1).reshape(len(options), -1)
+        costs = np.where(np.isfinite(miss).all(1), np.median(miss, axis=1), np.inf)
         best = int(np.argmin(costs))
         if costs[best] < 0.9 * costs[0]:
             poses[p] = options[best]

@@ -12,42 +12,37 @@ REFERENCES = 8
 """Photos whose own layout of markers is tried as the one that the others are judged by."""
 
 
-def square_poses(corners_px: Floats, lens: Intrinsics, edge_mm: float) -> list[tuple[Pose, float]]:
-    """The two poses ``cam_from_marker`` of a square with corners (4, 2), with their RMS in pixels, best first."""
-    _, rvecs, tvecs, errors = cv2.solvePnPGeneric(
-        square_corners(edge_mm), corners_px.reshape(4, 1, 2), lens.matrix, lens.distortion,
-        flags=cv2.SOLVEPNP_IPPE_SQUARE,
-    )  # fmt: skip
-    found = [
-        (Pose(rotation_from_vector(r.ravel()), t.ravel()), float(e))
-        for r, t, e in zip(rvecs, tvecs, errors.ravel(), strict=True)
-        if np.isfinite(r).all() and np.isfinite(t).all()
-    ]
-    return sorted(found, key=lambda pair: pair[1])
-
-
-def two_poses(seen: Observations, lens: Intrinsics, edge_mm: float) -> list[list[tuple[Pose, float]]]:
-    """:func:`square_poses` of every observation."""
-    return [square_poses(c, lens, edge_mm) for c in seen.corners_px]
+def two_poses(corners_px: Floats, lens: Intrinsics, edge_mm: float) -> list[list[tuple[Pose, float]]]:
+    """The two poses ``cam_from_marker`` of each square with corners (M, 4, 2), with their RMS in pixels, best first."""
+    square, found = square_corners(edge_mm), []
+    for corners in corners_px:
+        _, rvecs, tvecs, errors = cv2.solvePnPGeneric(
+            square, corners.reshape(4, 1, 2), lens.matrix, lens.distortion, flags=cv2.SOLVEPNP_IPPE_SQUARE
+        )
+        found.append([(r.ravel(), t.ravel(), float(e)) for r, t, e in zip(rvecs, tvecs, errors.ravel(), strict=True)])
+    turns = iter(rotation_from_vector(np.array([r for poses in found for r, _, _ in poses]).reshape(-1, 3)))
+    options = [[(Pose(next(turns), t), e) for _, t, e in poses] for poses in found]
+    finite = [[(p, e) for p, e in poses if np.isfinite(p.R).all() and np.isfinite(p.t).all()] for poses in options]
+    return [sorted(poses, key=lambda pair: pair[1]) for poses in finite]
 
 
 def agreeing_poses(seen: Observations, choices: list[list[tuple[Pose, float]]]) -> list[Pose | None]:
     """Per observation the pose whose normal the photo's other markers share; alone, the better fitting one."""
     picked: list[Pose | None] = [None] * len(choices)
     for photo in np.unique(seen.photo):
-        rows = np.flatnonzero(seen.photo == photo)
-        options = [(k, pose, e) for k in rows for pose, e in choices[k]]
-        if not options:
+        rows = [k for k in np.flatnonzero(seen.photo == photo) if choices[k]]
+        if not rows:
             continue
-        normals = np.stack([pose.R[:, 2] for _, pose, _ in options])
-        owner = np.array([k for k, _, _ in options])
+        options = [option for k in rows for option in choices[k]]
+        starts = np.cumsum([0, *(len(choices[k]) for k in rows[:-1])])
+        normals = np.stack([pose.R[:, 2] for pose, _ in options])
         misfit = 1 - normals @ normals.T
-        totals = np.array([sum(misfit[i][owner == k].min() for k in set(owner)) for i in range(len(options))])
+        totals = np.minimum.reduceat(misfit, starts, axis=1).sum(1)
         # One marker alone leaves a tie, which the fit decides.
-        leader = int(np.argmin(totals + 1e-3 * np.array([e for _, _, e in options])))
-        for k in set(owner):
-            mine = np.flatnonzero(owner == k)
-            picked[k] = options[mine[int(np.argmin(misfit[leader][mine]))]][1]
+        leader = int(np.argmin(totals + 1e-3 * np.array([e for _, e in options])))
+        for k, start in zip(rows, starts, strict=True):
+            mine = misfit[leader, start : start + len(choices[k])]
+            picked[k] = choices[k][int(np.argmin(mine))][0]
     return picked
 
 

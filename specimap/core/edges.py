@@ -1,0 +1,161 @@
+"""Corners of dark squares on white, as intersections of lines fitted to their edges in linear light.
+
+All edges of a photo are fitted at once: an edge takes a few hundred numbers, and one at a time they would cost more in
+calls than in arithmetic.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from specimap.core.geometry import Floats
+from specimap.core.robust import SIGMA_OF_MAD
+
+Flags = NDArray[np.bool_]
+Singles = NDArray[np.float32]
+
+PROFILES_PER_EDGE = 24
+EDGE_MARGIN = 0.12
+"""Share of an edge left out at either end, where the neighbouring edge blurs into the profile."""
+SAMPLE_PX = 0.25
+"""Distance of samples on a profile."""
+REACH_SHARES = 0.11, 0.08
+"""How far profiles reach, in widths of the square, in each pass: the second starts close and sees less around."""
+BATCH = 16
+"""Edges whose profiles are sampled together: of like reach, and few enough to stay in the processor's cache."""
+UNMEASURED_PX = 0.5
+"""Standard deviation of an edge, and of a corner, that gave no line."""
+
+
+def refine_corners(linear: Singles, squares: Floats) -> tuple[Floats, Floats]:
+    """Corners (N, 4, 2) of N squares seen in linear light (H, W), and one standard deviation (N,) of a corner, pixels.
+
+    ``squares`` (N, 4, 2): the corners found so far. An edge that gives no clear profile (covered, out of the image)
+    keeps the line through the corners it came with and a sigma of half a pixel.
+    """
+    corners, sigma = squares.copy(), np.full(len(squares), UNMEASURED_PX)
+    rows = np.arange(len(squares))
+    for share in REACH_SHARES:
+        if not len(rows):
+            break
+        before = corners[rows]
+        after = np.roll(before, -1, axis=1)
+        centres = np.repeat(before.mean(1, keepdims=True), 4, axis=1)
+        a, b, c = (np.asarray(x.reshape(-1, 2)) for x in (before, after, centres))
+        lines, errors = _fit_edges(linear, a, b, c, share)
+        lines, errors = lines.reshape(-1, 4, 3), errors.reshape(-1, 4)
+        crossed = np.cross(np.roll(lines, 1, axis=1), lines)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            moved = crossed[..., :2] / crossed[..., 2:]
+        # A corner that runs away betrays an edge fitted to something else.
+        limit = np.maximum(2.0, 0.15 * np.linalg.norm(before[:, 0] - before[:, 2], axis=1))
+        stays = np.linalg.norm(moved - before, axis=2).max(1) <= limit  # false for what is not finite
+        sigma[rows] = np.where(stays, np.sqrt(2 * np.mean(errors**2, axis=1)), UNMEASURED_PX)
+        rows = rows[stays]
+        corners[rows] = moved[stays]
+    return corners, sigma
+
+
+def _fit_edges(linear: Singles, a: Floats, b: Floats, centres: Floats, share: float) -> tuple[Floats, Floats]:
+    """Lines (E, 3) with ``line @ (x, y, 1) = 0`` along the edges from ``a`` to ``b`` (both (E, 2)), and their standard
+    deviations (E,) in pixels. ``centres`` (E, 2): of the squares they belong to."""
+    length = np.linalg.norm(b - a, axis=1)
+    along = (b - a) / length[:, None]
+    normal = np.stack([along[:, 1], -along[:, 0]], -1)
+    depth = _dot(normal, centres - a)
+    normal *= np.where(depth > 0, -1.0, 1.0)[:, None]  # outward: from black into the white quiet zone
+    lines = _lines(normal, a)
+    errors = np.full(len(a), UNMEASURED_PX)
+    # The dark border is one module wide (a sixth of the edge, or less in larger dictionaries), seen at a slant.
+    reach = np.clip(share * 2 * np.abs(depth), 1.6, 8.0)
+    s = np.linspace(EDGE_MARGIN, 1 - EDGE_MARGIN, PROFILES_PER_EDGE) * length[:, None]
+    v, clear = np.empty(s.shape), np.empty(s.shape, bool)
+    for some in np.array_split(np.argsort(reach), -(-len(a) // BATCH)):
+        v[some], clear[some] = _positions(linear, *(x[some] for x in (a, along, normal, s, reach)))
+    fits = np.flatnonzero(clear.sum(1) >= PROFILES_PER_EDGE // 2)
+    if not len(fits):
+        return lines, errors
+    slope, offset, scatter, kept = _fit_robustly(s[fits], v[fits], clear[fits])
+    across = normal[fits] - along[fits] * slope[:, None]
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    found = _lines(across, a[fits] + normal[fits] * offset[:, None])
+    # Neighbouring profiles share pixels: about one independent measurement a pixel of edge; twice as wide at
+    # the ends as in the middle, where a corner lies.
+    error = np.maximum(0.01, 2 * scatter / np.sqrt(np.minimum(length[fits], kept)))
+    good = kept >= PROFILES_PER_EDGE // 3
+    lines[fits[good]], errors[fits[good]] = found[good], error[good]
+    return lines, errors
+
+
+def _positions(
+    linear: Singles, a: Floats, along: Floats, normal: Floats, s: Floats, reach: Floats
+) -> tuple[Floats, Flags]:
+    """Where the edge crosses the profiles at ``s`` (E, K) along it, in pixels outward (E, K), and which are clear."""
+    # Profiles reach as far as their own edge asks; what pads them to the longest has no say.
+    count = np.ceil((2 * reach + 1e-6) / SAMPLE_PX).astype(int)
+    steps = np.arange(count.max())
+    valid = (steps < count[:, None])[:, None]
+    d = SAMPLE_PX * steps - reach[:, None]
+    feet = a[:, None] + s[..., None] * along[:, None]
+    height, width = linear.shape
+    inside = np.ones(s.shape, bool)
+    for end in (-reach, SAMPLE_PX * (count - 1) - reach):
+        tip = feet + (end[:, None] * normal)[:, None]
+        inside &= ((tip >= 1) & (tip <= [width - 2, height - 2])).all(-1)
+    x, y = ((feet[..., i, None] + (d * normal[:, i, None])[:, None]).astype(np.float32) for i in (0, 1))
+    rows = len(a), -1
+    sampled = cv2.remap(linear, x.reshape(rows), y.reshape(rows), cv2.INTER_CUBIC).reshape(x.shape)
+    profile = np.where(valid, sampled, sampled[..., :1]).astype(float)
+    slope = np.gradient(profile, SAMPLE_PX, axis=2)
+    last = np.broadcast_to((count - 1)[:, None, None], (*s.shape, 1))
+    ends = np.take_along_axis(profile, last, 2) - np.take_along_axis(profile, last - 1, 2)
+    np.put_along_axis(slope, last, ends / SAMPLE_PX, 2)
+    weight = np.where(valid, np.clip(slope, 0, None), 0.0)
+    contrast = profile.max(2) - profile.min(2)
+    clear = inside & (contrast > 0.25 * _median(contrast, inside)[:, None]) & (weight.sum(2) > 0)
+    clear[inside.sum(1) < PROFILES_PER_EDGE // 2] = False
+    # Centroid of the slope in a window that is then centred on it: symmetric blur does not move it.
+    position = np.take_along_axis(d, weight.argmax(2), 1)
+    half = np.maximum(1.2, 0.7 * reach)[:, None, None]
+    for _ in range(3):
+        windowed = weight * np.clip(1 - np.abs(d[:, None] - position[..., None]) / half, 0, None)
+        total, moment = windowed.sum(2), (windowed @ d[..., None])[..., 0]
+        position = np.where(total > 0, moment / np.maximum(total, 1e-12), position)
+    return position, clear
+
+
+def _fit_robustly(u: Floats, v: Floats, clear: Flags) -> tuple[Floats, Floats, Floats, NDArray[np.int64]]:
+    """Lines ``v = slope u + offset`` through the clear ones of points (E, K): slope, offset, scatter of what was kept,
+    and how many were, at the fewest (E,)."""
+    keep, fewest = clear, clear.sum(1)
+    for _ in range(4):
+        n = keep.sum(1)
+        mean_u, mean_v = ((x * keep).sum(1) / n for x in (u, v))
+        off_u = (u - mean_u[:, None]) * keep
+        slope = (off_u * v).sum(1) / np.maximum((off_u**2).sum(1), 1e-12)
+        offset = mean_v - slope * mean_u
+        residual = v - (slope[:, None] * u + offset[:, None])
+        limit = np.maximum(0.08, 2.5 * SIGMA_OF_MAD * _median(np.abs(residual), keep))
+        keep = clear & (np.abs(residual) <= limit[:, None])
+        fewest = np.minimum(fewest, keep.sum(1))
+    n = keep.sum(1)
+    mean = (residual * keep).sum(1) / n
+    scatter = np.sqrt((((residual - mean[:, None]) * keep) ** 2).sum(1) / n)
+    return slope, offset, scatter, np.where(fewest < PROFILES_PER_EDGE // 3, fewest, n)
+
+
+def _median(values: Floats, keep: Flags) -> Floats:
+    """Median (E,) of those of ``values`` (E, K) that ``keep`` names; infinite where there are none."""
+    ordered, n = np.sort(np.where(keep, values, np.inf), axis=1), keep.sum(1)
+    middle = np.stack([(n - 1) // 2, n // 2], 1)
+    return np.asarray(np.take_along_axis(ordered, middle, 1).mean(1))
+
+
+def _lines(normal: Floats, through: Floats) -> Floats:
+    return np.concatenate([normal, -_dot(normal, through)[:, None]], 1)
+
+
+def _dot(a: Floats, b: Floats) -> Floats:
+    return np.asarray((a * b).sum(1))
