@@ -116,7 +116,7 @@ def test_the_default_backends_keys_know_nothing_of_other_backends(tmp_path: Path
     settings = run_with()
     keys = surface_keys(PHOTOS, settings)
     chosen = settings.as_dict()
-    parts = {"photos": PHOTOS, "acquisition": chosen["acquisition"], "s": chosen["reconstruct"], "edge_mm": 6.8}
+    parts = {"photos": PHOTOS, "acquisition": chosen["acquisition"], "s": chosen["reconstruct"]}
     assert keys["reconstruct"] == key_of("reconstruct", parts)
     bring_mast3r(tmp_path, bare)
     bring_da3(tmp_path, bare)
