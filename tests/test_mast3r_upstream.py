@@ -14,6 +14,7 @@ from mast3r_scene import see, upstream
 from PIL import Image
 from scenes import SMALL, phantom_on_disk
 
+from specimap.core.adjust import AdjustSettings, Form
 from specimap.core.errors import BackendUnavailableError, DepthNotFoundError, PhotosNotConnectedError
 from specimap.core.evidence.truth import judge
 from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline
@@ -90,7 +91,11 @@ def test_a_network_that_knows_nothing_ends_in_an_answer_or_a_reason(tmp_path: Pa
     assert max(shares) > 0.5
 
 
-def test_the_whole_way_with_exact_predictions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("form", ["rigid", "free"])
+def test_the_whole_way_with_exact_predictions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: Form
+) -> None:
+    """Held to the markers, and as published."""
     home, python = upstream()
     phantom = replace(SMALL, photos=8)
     disk = phantom_on_disk(tmp_path / "phantom", phantom)
@@ -109,7 +114,7 @@ def test_the_whole_way_with_exact_predictions(tmp_path: Path, monkeypatch: pytes
     # The oracle brings its own stand-in for torchvision.
     monkeypatch.setattr("specimap.core.reconstruct.learned.required.check_backend", lambda name: None)
     out = tmp_path / "out"
-    settings = PipelineSettings(reconstruct=ReconstructSettings(backend="mast3r"))
+    settings = PipelineSettings(reconstruct=ReconstructSettings(backend="mast3r"), adjust=AdjustSettings(form))
     report = run_pipeline(Inputs(disk.photos, disk.header), out, settings, workers=1)
     assert report.photos.used == [p.name for p in seen.photos]
     assert {"licence_non_commercial", "backend_run"} <= {w.code for w in report.warnings}
