@@ -103,6 +103,7 @@ def test_code_in_a_checkpoint_is_refused_and_not_run(tmp_path: Path, place: str)
     with pytest.raises(BackendUnavailableError, match="holds code") as caught:
         read_checkpoint(save(tmp_path / "evil.pth", content))
     assert caught.value.details["reason"] == "weights_unsafe"
+    assert caught.value.details["found"] == f"{os.system.__module__}.system"
     assert not witness.exists()
 
 

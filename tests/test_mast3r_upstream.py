@@ -91,17 +91,23 @@ def test_a_network_that_knows_nothing_ends_in_an_answer_or_a_reason(tmp_path: Pa
     assert max(shares) > 0.5
 
 
-@pytest.mark.parametrize("form", ["rigid", "free"])
+@pytest.mark.parametrize(("form", "bare"), [("rigid", 0), ("free", 0), ("rigid", 1), ("free", 1)])
 def test_the_whole_way_with_exact_predictions(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: Form
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: Form, bare: int
 ) -> None:
-    """Held to the markers, and as published."""
+    """Held to the markers, and as published; the last ``bare`` photos show nothing and must not stop the rest."""
     home, python = upstream()
     phantom = replace(SMALL, photos=8)
     disk = phantom_on_disk(tmp_path / "phantom", phantom)
+    names = sorted(p.name for p in disk.photos.iterdir())
+    for name in names[len(names) - bare :]:
+        noise = np.random.default_rng(0).normal(128, 3, (phantom.photo_size, phantom.photo_size, 3))
+        Image.fromarray(noise.astype(np.uint8)).save(disk.photos / name)
     seen = see(disk.photos, phantom, 128)
     weights = tmp_path / "oracle.npz"
-    np.savez(weights, images=seen.images, points=seen.points, poses=seen.poses, sure=np.ones(seen.images.shape[:3]))
+    sure = np.ones(seen.images.shape[:3])
+    sure[len(sure) - bare :] = 0
+    np.savez(weights, images=seen.images, points=seen.points, poses=seen.poses, sure=sure)
     values = {"HOME": home, "WEIGHTS": weights, "SIZE_PX": 128, "SCHEDULE": "100,100", "CACHE": tmp_path / "cache"}
     for name, value in values.items():
         monkeypatch.setenv(PREFIX + name, str(value))
