@@ -126,10 +126,12 @@ def test_other_files_are_refused(tmp_path: Path, content: object) -> None:
     assert caught.value.details["reason"] == "weights_unknown"
 
 
-@pytest.mark.parametrize("data", [b"", b"text", b"PK\x03\x04 cut off"])
+@pytest.mark.parametrize("data", [b"", b"text", b"<html>not found</html>", b"PK\x03\x04 cut off"])
 def test_files_that_are_none_are_refused(tmp_path: Path, data: bytes) -> None:
     pytest.importorskip("torch", reason="torch is not installed")
     path = tmp_path / "broken.pth"
     path.write_bytes(data)
-    with pytest.raises(BackendUnavailableError):
+    with pytest.raises(BackendUnavailableError, match="does not read") as caught:
         read_checkpoint(path)
+    assert caught.value.details["reason"] == "weights_unknown"
+    assert "weights_only" not in caught.value.message

@@ -108,7 +108,8 @@ def test_the_whole_way_with_exact_predictions(
     sure = np.ones(seen.images.shape[:3])
     sure[len(sure) - bare :] = 0
     np.savez(weights, images=seen.images, points=seen.points, poses=seen.poses, sure=sure)
-    values = {"HOME": home, "WEIGHTS": weights, "SIZE_PX": 128, "SCHEDULE": "100,100", "CACHE": tmp_path / "cache"}
+    # Upstream's own schedule: cut to a third, its alignment ends off by half a millimetre, and the published way keeps it.
+    values = {"HOME": home, "WEIGHTS": weights, "SIZE_PX": 128, "CACHE": tmp_path / "cache"}
     for name, value in values.items():
         monkeypatch.setenv(PREFIX + name, str(value))
     if python:
