@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +12,11 @@ import pytest
 from numpy.typing import NDArray
 
 from specimap.core.acquisition import AcquisitionSettings, Photo, photo_paths, read_photos
-from specimap.core.geometry import Array, Floats, Intrinsics, Pose, View
+from specimap.core.adjust import AdjustSettings, Form, adjust
+from specimap.core.geometry import Array, Floats, Intrinsics, Pose, View, fit_similarity
 from specimap.core.phantom import PhantomSettings
 from specimap.core.phantom.phantom import Phantom
+from specimap.core.phantom.truth import Truth
 from specimap.core.reconstruct.backend import (
     CornersInPhotos,
     Reconstruction,
@@ -145,6 +147,18 @@ def true_points(found: Reconstruction, seen: Seen) -> list[Floats]:
         left, top = round(cx - m.intrinsics.cx), round(cy - m.intrinsics.cy)
         true.append(seen.points[found.photos[m.photo]][rows + top, cols + left].astype(float))
     return true
+
+
+def adjusted_errors_mm(found: Reconstruction, seen: Seen, truth: Truth, form: Form) -> Floats:
+    """Distances of all points from what is truly there, once stage 2 refined the poses; laid on the true corners."""
+    done = adjust(found.lens, found.poses, seen.corners.seen, seen.corners.marker_ids, AdjustSettings(form))
+    rows = [list(truth.marker_ids).index(i) for i in done.marker_ids]
+    _, R, t = fit_similarity(done.corners.reshape(-1, 3), truth.marker_corners[rows].reshape(-1, 3))
+    apart = []
+    for m, true in zip(found.maps, true_points(found, seen), strict=True):
+        scaled = replace(m, depth=m.depth * np.float32(done.scale))
+        apart.append(np.linalg.norm(scaled.points(done.poses[m.photo]) @ R.T + t - true, axis=1))
+    return np.concatenate(apart)
 
 
 def upstream() -> tuple[Path, str | None]:

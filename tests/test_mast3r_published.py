@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 from backend_files import bring_mast3r
-from mast3r_scene import CLOSE_MM, SCRIPT, Seen, answer_of, reconstruct, scripted_settings, see, true_points
+from mast3r_scene import (
+    CLOSE_MM,
+    SCRIPT,
+    Seen,
+    adjusted_errors_mm,
+    answer_of,
+    reconstruct,
+    scripted_settings,
+    see,
+    true_points,
+)
 from scenes import SMALL, OnDisk
 
-from specimap.core.adjust import AdjustSettings, Form, adjust
+from specimap.core.adjust import AdjustSettings
 from specimap.core.evidence.truth import judge
-from specimap.core.geometry import Floats, Pose, fit_similarity, rotation_from_vector
+from specimap.core.geometry import Pose, fit_similarity, rotation_from_vector
 from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline
-from specimap.core.reconstruct.backend import Reconstruction, ReconstructSettings
+from specimap.core.reconstruct.backend import ReconstructSettings
 from specimap.core.reconstruct.mast3r import backend
 from specimap.core.reconstruct.mast3r.settings import PREFIX, Mast3rSettings
 
@@ -33,18 +43,6 @@ def seen(small: OnDisk) -> Seen:
 @pytest.fixture
 def settings(tmp_path: Path) -> Mast3rSettings:
     return scripted_settings(tmp_path, 192)
-
-
-def adjusted_errors_mm(found: Reconstruction, seen: Seen, small: OnDisk, form: Form) -> Floats:
-    """Distances of all points from what is truly there, once stage 2 refined the poses; laid on the true corners."""
-    done = adjust(found.lens, found.poses, seen.corners.seen, seen.corners.marker_ids, AdjustSettings(form))
-    rows = [list(small.truth.marker_ids).index(i) for i in done.marker_ids]
-    _, R, t = fit_similarity(done.corners.reshape(-1, 3), small.truth.marker_corners[rows].reshape(-1, 3))
-    apart = []
-    for m, true in zip(found.maps, true_points(found, seen), strict=True):
-        scaled = replace(m, depth=m.depth * np.float32(done.scale))
-        apart.append(np.linalg.norm(scaled.points(done.poses[m.photo]) @ R.T + t - true, axis=1))
-    return np.concatenate(apart)
 
 
 def test_cameras_and_depth_are_the_networks_but_for_frame_and_scale(
@@ -78,7 +76,7 @@ def test_refined_poses_put_exact_depth_where_it_is(
 ) -> None:
     found = reconstruct(seen, answer_of(seen, frame=FRAME), settings, monkeypatch, hold_to_markers=False)
     # The corners' noise alone is left.
-    assert 1e-3 < float(np.median(adjusted_errors_mm(found, seen, small, "free"))) < CLOSE_MM
+    assert 1e-3 < float(np.median(adjusted_errors_mm(found, seen, small.truth, "free"))) < CLOSE_MM
 
 
 @pytest.mark.parametrize("factor", [0.98, 1.02])
@@ -89,7 +87,7 @@ def test_a_wrong_focal_length_stays_in_the_published_cloud(
     median = {}
     for hold, form in [(True, "rigid"), (False, "free"), (False, "rigid")]:
         found = reconstruct(seen, arrays, settings, monkeypatch, hold_to_markers=hold)
-        median[hold, form] = float(np.median(adjusted_errors_mm(found, seen, small, form)))  # type: ignore[arg-type]
+        median[hold, form] = float(np.median(adjusted_errors_mm(found, seen, small.truth, form)))  # type: ignore[arg-type]
     off_mm = abs(factor - 1) * REACH_MM
     assert 1e-3 < median[True, "rigid"] < CLOSE_MM
     # Seen under angles off by a fiftieth, places are off by up to a fiftieth of how far out they are.

@@ -2,8 +2,8 @@
 
 MASt3R leaves focal length and distance uncertain together. Applying poses that were refined on the corners, with
 another focal length, to depth that was found with MASt3R's own puts that depth in the wrong place: measured with exact
-predictions, 1.4 mm for a focal length 1 % off. So by default cameras are adjusted here, and each photo's depth is fitted
-to what the adjusted markers say of it. As published, neither is touched, and stage 2 keeps the focal length too.
+predictions, 1.4 mm for a focal length 1 % off. So by default cameras are adjusted here, and each photo's depth is
+fitted to what the adjusted markers say of it. As published, neither is touched, and stage 2 keeps the focal length too.
 """
 
 from __future__ import annotations
