@@ -3,7 +3,8 @@
 It runs what :mod:`specimap.core.reconstruct.mast3r.child` runs, upstream's code included, and puts an oracle in the
 network's place: exact points in the first photo's frame, even confidence, and descriptors that are alike where the
 points are near. ``ORACLE`` in the environment names an archive with ``images`` (N, H, W, 3) as the network gets them,
-``points`` (N, H, W, 3) in the world, ``poses`` (N, 3, 4) ``cam_from_world``.
+``points`` (N, H, W, 3) in the world, ``poses`` (N, 3, 4) ``cam_from_world``, ``sure`` (N, H, W) from 0, where nothing
+shows, to 1.
 """
 
 from __future__ import annotations
@@ -37,7 +38,10 @@ class Oracle(torch.nn.Module):  # type: ignore[misc]
             self._poses = torch.from_numpy(stored["poses"]).float()
             self._sure = torch.from_numpy(stored["sure"]).float()
         phase = torch.cat([self._points * (2 * np.pi / wave) for wave in WAVES_MM], -1)
-        self._features = torch.nn.functional.normalize(torch.cat([phase.sin(), phase.cos()], -1), dim=-1)
+        features = torch.cat([phase.sin(), phase.cos()], -1)
+        # Where nothing shows, one place looks like another.
+        features = torch.where(self._sure[..., None] > 0, features, torch.ones_like(features))
+        self._features = torch.nn.functional.normalize(features, dim=-1)
 
     def _recognise(self, image: torch.Tensor) -> torch.Tensor:
         pixels = ((image[0] * 0.5 + 0.5) * 255).round().to(torch.uint8).permute(1, 2, 0)

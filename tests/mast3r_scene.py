@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +12,26 @@ import pytest
 from numpy.typing import NDArray
 
 from specimap.core.acquisition import AcquisitionSettings, Photo, photo_paths, read_photos
-from specimap.core.geometry import Floats, Intrinsics, Pose, View
+from specimap.core.adjust import AdjustSettings, Form, adjust
+from specimap.core.geometry import Array, Floats, Intrinsics, Pose, View, fit_similarity
 from specimap.core.phantom import PhantomSettings
 from specimap.core.phantom.phantom import Phantom
-from specimap.core.reconstruct.backend import CornersInPhotos, corners_in_photos, detect_in_photos
+from specimap.core.phantom.truth import Truth
+from specimap.core.reconstruct.backend import (
+    CornersInPhotos,
+    Reconstruction,
+    ReconstructSettings,
+    corners_in_photos,
+    detect_in_photos,
+)
+from specimap.core.reconstruct.mast3r.backend import Mast3rBackend
 from specimap.core.reconstruct.mast3r.images import Preparation, plan_preparation
+from specimap.core.reconstruct.mast3r.settings import NEEDED, Mast3rSettings
+
+SCRIPT = Path(__file__).with_name("mast3r_scripted.py")
+CLOSE_MM = 0.15
+"""Median distance of exact depth from truth, after the cameras were solved from corners: a corner is seen to 0.2 px of
+0.2 mm, and depth is sampled at markers of 20 network pixels."""
 
 NEEDS = ("torch", "roma", "scipy", "cv2", "PIL", "einops", "huggingface_hub", "trimesh", "tqdm", "matplotlib")
 """What upstream's alignment imports; torchvision aside, for which there is a stand-in."""
@@ -86,6 +101,64 @@ def answer_of(
         "depth": seen.depth.astype(float) / unit_mm,
         "confidence": np.full(seen.depth.shape, 5.0),
     }
+
+
+def scripted_settings(folder: Path, size_px: int) -> Mast3rSettings:
+    """Settings with a checkout and weights in ``folder`` that pass where nothing reads them."""
+    home = folder / "checkout"
+    for part in NEEDED:
+        (home / part).parent.mkdir(parents=True, exist_ok=True)
+        (home / part).touch()
+    (folder / "weights.pth").write_bytes(b"weights")
+    return Mast3rSettings(home=home, weights=folder / "weights.pth", size_px=size_px, cache=folder / "cache")
+
+
+def reconstruct(
+    seen: Seen,
+    arrays: dict[str, Array],
+    settings: Mast3rSettings,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    hold_to_markers: bool = True,
+) -> Reconstruction:
+    """Stage 1 on what the child is scripted to answer."""
+    assert settings.cache is not None
+    path = settings.cache.with_name("answer.npz")
+    np.savez(path, **arrays)  # type: ignore[arg-type]
+    monkeypatch.setenv("ANSWER", str(path))
+    shares: list[float] = []
+    found = Mast3rBackend(settings, SCRIPT).reconstruct(
+        seen.photos, seen.corners, ReconstructSettings(hold_to_markers=hold_to_markers), workers=2,
+        progress=shares.append,
+    )  # fmt: skip
+    assert list(settings.cache.iterdir()) == []
+    assert shares == sorted(shares)
+    assert 0.9 < shares[-1] <= 1
+    return found
+
+
+def true_points(found: Reconstruction, seen: Seen) -> list[Floats]:
+    """What is truly there (n, 3) at the known depths of each map, in their order."""
+    true = []
+    for m in found.maps:
+        rows, cols = np.nonzero(m.depth)
+        # The map is a part of the photo: its principal point tells which.
+        cx, cy = seen.plan.to_network(np.array([found.lens.cx, found.lens.cy]))
+        left, top = round(cx - m.intrinsics.cx), round(cy - m.intrinsics.cy)
+        true.append(seen.points[found.photos[m.photo]][rows + top, cols + left].astype(float))
+    return true
+
+
+def adjusted_errors_mm(found: Reconstruction, seen: Seen, truth: Truth, form: Form) -> Floats:
+    """Distances of all points from what is truly there, once stage 2 refined the poses; laid on the true corners."""
+    done = adjust(found.lens, found.poses, seen.corners.seen, seen.corners.marker_ids, AdjustSettings(form))
+    rows = [list(truth.marker_ids).index(i) for i in done.marker_ids]
+    _, R, t = fit_similarity(done.corners.reshape(-1, 3), truth.marker_corners[rows].reshape(-1, 3))
+    apart = []
+    for m, true in zip(found.maps, true_points(found, seen), strict=True):
+        scaled = replace(m, depth=m.depth * np.float32(done.scale))
+        apart.append(np.linalg.norm(scaled.points(done.poses[m.photo]) @ R.T + t - true, axis=1))
+    return np.concatenate(apart)
 
 
 def upstream() -> tuple[Path, str | None]:

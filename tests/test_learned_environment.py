@@ -16,6 +16,7 @@ from backend_files import bring_da3, bring_mast3r, no_variables
 from scenes import OnDisk
 from worker_scene import shop
 
+from specimap.core.adjust import AdjustSettings
 from specimap.core.errors import BackendUnavailableError, SettingsError
 from specimap.core.pipeline.artefacts import key_of
 from specimap.core.pipeline.keys import surface_keys
@@ -41,9 +42,9 @@ def bare(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     return monkeypatch
 
 
-def run_with(backend: str = "colmap") -> PipelineSettings:
+def run_with(backend: str = "colmap", adjustment: str = "rigid") -> PipelineSettings:
     return settings_from(
-        edge_mm=6.8, dictionary="DICT_4X4_50", method="camera", adjustment="rigid", r_pc=0.5, r_reg=2.0,
+        edge_mm=6.8, dictionary="DICT_4X4_50", method="camera", adjustment=adjustment, r_pc=0.5, r_reg=2.0,
         backend=backend, features="auto", working_px=1280,
     )  # fmt: skip
 
@@ -116,7 +117,7 @@ def test_the_default_backends_keys_know_nothing_of_other_backends(tmp_path: Path
     settings = run_with()
     keys = surface_keys(PHOTOS, settings)
     chosen = settings.as_dict()
-    parts = {"photos": PHOTOS, "acquisition": chosen["acquisition"], "s": chosen["reconstruct"], "edge_mm": 6.8}
+    parts = {"photos": PHOTOS, "acquisition": chosen["acquisition"], "s": chosen["reconstruct"]}
     assert keys["reconstruct"] == key_of("reconstruct", parts)
     bring_mast3r(tmp_path, bare)
     bring_da3(tmp_path, bare)
@@ -125,6 +126,21 @@ def test_the_default_backends_keys_know_nothing_of_other_backends(tmp_path: Path
     assert surface_keys(PHOTOS, run_with()) == keys
     bare.setenv("SPECIMAP_DENSE_DEVICE", "cpu")
     assert not set(surface_keys(PHOTOS, run_with()).values()) & set(keys.values())
+
+
+@pytest.mark.parametrize("backend", ["colmap", *(name for name, _ in BACKENDS)])
+def test_the_adjustment_is_an_input_of_stage_1_where_that_finds_cameras_without_the_markers(
+    backend: str, tmp_path: Path, bare: pytest.MonkeyPatch
+) -> None:
+    bring_mast3r(tmp_path, bare)
+    bring_da3(tmp_path, bare)
+    rigid, free = (surface_keys(PHOTOS, run_with(backend, form)) for form in ("rigid", "free"))
+    assert rigid["adjust"] != free["adjust"]
+    assert (rigid["reconstruct"] == free["reconstruct"]) == (backend != "mast3r")
+    assert run_with(backend, "free").for_stage1().hold_to_markers == (backend != "mast3r")
+    # An edge that stage 2 alone was told counts as well.
+    wide = replace(run_with(backend), adjust=AdjustSettings(edge_mm=7.0))
+    assert surface_keys(PHOTOS, wide)["reconstruct"] != rigid["reconstruct"]
 
 
 @pytest.mark.parametrize(("backend", "bring"), BACKENDS)

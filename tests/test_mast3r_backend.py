@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mast3r_scene import Seen, answer_of, see
+from mast3r_scene import CLOSE_MM, Seen, answer_of, reconstruct, scripted_settings, see, true_points
 from scenes import SMALL, OnDisk
 
 from specimap.core.errors import (
@@ -18,19 +18,15 @@ from specimap.core.errors import (
     MarkerGeometryError,
     PhotosNotConnectedError,
 )
-from specimap.core.geometry import Array, Floats, Pose, fit_similarity, rotation_from_vector
-from specimap.core.reconstruct.backend import Reconstruction, ReconstructSettings
-from specimap.core.reconstruct.mast3r.backend import LICENCE, Mast3rBackend
+from specimap.core.geometry import Floats, Pose, fit_similarity, rotation_from_vector
+from specimap.core.reconstruct.backend import Reconstruction
+from specimap.core.reconstruct.mast3r.backend import LICENCE
 from specimap.core.reconstruct.mast3r.maps import bytes_of
-from specimap.core.reconstruct.mast3r.settings import NEEDED, Mast3rSettings
+from specimap.core.reconstruct.mast3r.settings import Mast3rSettings
 from specimap.core.solver import Observations
 
-SCRIPT = Path(__file__).with_name("mast3r_scripted.py")
 FRAME = Pose(rotation_from_vector(np.array([0.3, -1.1, 0.7])), np.array([20.0, -5.0, 90.0]))
 """Between the phantom's world and that of the predictions."""
-CLOSE_MM = 0.15
-"""Median distance of exact depth from truth, after the cameras were solved from corners: a corner is seen to 0.2 px of
-0.2 mm, and depth is sampled at markers of 20 network pixels."""
 
 
 @pytest.fixture(scope="module")
@@ -40,44 +36,17 @@ def seen(small: OnDisk) -> Seen:
 
 @pytest.fixture
 def settings(tmp_path: Path) -> Mast3rSettings:
-    home = tmp_path / "checkout"
-    for part in NEEDED:
-        (home / part).parent.mkdir(parents=True, exist_ok=True)
-        (home / part).touch()
-    (tmp_path / "weights.pth").write_bytes(b"weights")
-    return Mast3rSettings(home=home, weights=tmp_path / "weights.pth", size_px=192, cache=tmp_path / "cache")
-
-
-def reconstruct(
-    seen: Seen, arrays: dict[str, Array], settings: Mast3rSettings, monkeypatch: pytest.MonkeyPatch
-) -> Reconstruction:
-    assert settings.cache is not None
-    path = settings.cache.with_name("answer.npz")
-    np.savez(path, **arrays)  # type: ignore[arg-type]
-    monkeypatch.setenv("ANSWER", str(path))
-    shares: list[float] = []
-    found = Mast3rBackend(settings, SCRIPT).reconstruct(
-        seen.photos, seen.corners, ReconstructSettings(), workers=2, progress=shares.append
-    )
-    assert list(settings.cache.iterdir()) == []
-    assert shares == sorted(shares)
-    assert 0.9 < shares[-1] <= 1
-    return found
+    return scripted_settings(tmp_path, 192)
 
 
 def errors_mm(found: Reconstruction, seen: Seen, small: OnDisk) -> list[Floats]:
     """Distances of each map's points from what is truly there, after a rigid fit of the cameras."""
     truth = [small.truth.views[p].cam_from_world for p in found.photos]
     _, R, t = fit_similarity(np.stack([p.centre for p in found.poses]), np.stack([p.centre for p in truth]))
-    apart = []
-    for m in found.maps:
-        rows, cols = np.nonzero(m.depth)
-        # The map is a part of the photo: its principal point tells which.
-        cx, cy = seen.plan.to_network(np.array([found.lens.cx, found.lens.cy]))
-        left, top = round(cx - m.intrinsics.cx), round(cy - m.intrinsics.cy)
-        true = seen.points[found.photos[m.photo]][rows + top, cols + left]
-        apart.append(np.linalg.norm(m.points(found.poses[m.photo]) @ R.T + t - true, axis=1))
-    return apart
+    return [
+        np.linalg.norm(m.points(found.poses[m.photo]) @ R.T + t - true, axis=1)
+        for m, true in zip(found.maps, true_points(found, seen), strict=True)
+    ]
 
 
 # ---- good predictions ---------------------------------------------------------------------------------

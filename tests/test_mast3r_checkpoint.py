@@ -103,6 +103,7 @@ def test_code_in_a_checkpoint_is_refused_and_not_run(tmp_path: Path, place: str)
     with pytest.raises(BackendUnavailableError, match="holds code") as caught:
         read_checkpoint(save(tmp_path / "evil.pth", content))
     assert caught.value.details["reason"] == "weights_unsafe"
+    assert caught.value.details["found"] == f"{os.system.__module__}.system"
     assert not witness.exists()
 
 
@@ -125,10 +126,12 @@ def test_other_files_are_refused(tmp_path: Path, content: object) -> None:
     assert caught.value.details["reason"] == "weights_unknown"
 
 
-@pytest.mark.parametrize("data", [b"", b"text", b"PK\x03\x04 cut off"])
+@pytest.mark.parametrize("data", [b"", b"text", b"<html>not found</html>", b"PK\x03\x04 cut off"])
 def test_files_that_are_none_are_refused(tmp_path: Path, data: bytes) -> None:
     pytest.importorskip("torch", reason="torch is not installed")
     path = tmp_path / "broken.pth"
     path.write_bytes(data)
-    with pytest.raises(BackendUnavailableError):
+    with pytest.raises(BackendUnavailableError, match="does not read") as caught:
         read_checkpoint(path)
+    assert caught.value.details["reason"] == "weights_unknown"
+    assert "weights_only" not in caught.value.message

@@ -24,8 +24,8 @@ def surface_keys(photos: Mapping[str, str], settings: PipelineSettings) -> dict[
     identity = backend_identity(settings.reconstruct.backend)
     reconstruct = key_of(
         "reconstruct",
-        {"photos": dict(photos), "acquisition": asdict(settings.acquisition), "s": asdict(settings.reconstruct),
-         "edge_mm": settings.adjust.edge_mm, **({"backend": identity} if identity else {})},
+        {"photos": dict(photos), "acquisition": asdict(settings.acquisition), "s": asdict(settings.for_stage1()),
+         **({"backend": identity} if identity else {})},
     )  # fmt: skip
     adjust = key_of(
         "adjust",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import cast
 
 from specimap.core.acquisition import AcquisitionSettings
@@ -18,6 +18,8 @@ from specimap.core.render import RenderSettings
 from specimap.core.surface import SurfaceSettings
 
 BACKENDS = ("colmap", "mast3r", "da3")
+WITH_OWN_CAMERAS = ("mast3r",)
+"""Backends that find cameras without the markers."""
 FEATURES = ("auto", "sift", "aliked")
 
 
@@ -66,9 +68,18 @@ class PipelineSettings:
                     f"There is no {name} {chosen!r}.", advice=f"Choose one of: {', '.join(known)}.", setting=name
                 )
 
+    def for_stage1(self) -> ReconstructSettings:
+        """Stage 1's settings with what stage 2's say to it: the edge, and for whom the cameras are.
+
+        The published adjustment takes cameras as the backend found them, depth along with them; for backends whose
+        cameras are the markers' own it changes nothing in stage 1.
+        """
+        as_found = self.adjust.form == "free" and self.reconstruct.backend in WITH_OWN_CAMERAS
+        return replace(self.reconstruct, edge_mm=self.adjust.edge_mm, hold_to_markers=not as_found)
+
     def as_dict(self) -> dict[str, object]:
-        """JSON-ready."""
-        return asdict(self)
+        """JSON-ready, with stage 1's as it takes them."""
+        return asdict(replace(self, reconstruct=self.for_stage1()))
 
 
 def settings_from(

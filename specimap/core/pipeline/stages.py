@@ -89,7 +89,7 @@ def reconstruct_stage(
         reconstruction = backend.reconstruct(
             photos,
             corners,
-            replace(settings.reconstruct, edge_mm=settings.adjust.edge_mm),
+            settings.for_stage1(),
             workers=workers,
             progress=lambda s: progress(0.2 + 0.8 * s),
         )

@@ -35,12 +35,14 @@ FeatureChoice = Literal["auto", "sift", "aliked"]
 @dataclass(frozen=True)
 class ReconstructSettings:
     """Stage 1. ``dictionary``: the markers' family. ``edge_mm``: their edge. ``backend``: which backend.
-    ``features``: what locates photos that the markers leave open."""
+    ``features``: what locates photos that the markers leave open. ``hold_to_markers``: whether cameras and depth that a
+    backend found without the markers are adjusted to them, or only brought to their frame and scale."""
 
     dictionary: str = "DICT_4X4_50"
     edge_mm: float = 6.8
     backend: str = "colmap"
     features: FeatureChoice = "auto"
+    hold_to_markers: bool = True
     depth: DepthSettings = field(default_factory=DepthSettings)
     seed: int = 0
 

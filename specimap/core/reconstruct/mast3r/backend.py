@@ -25,7 +25,7 @@ from specimap.core.reconstruct.learned.process import Answer, run_child
 from specimap.core.reconstruct.learned.remarks import left_out, ran
 from specimap.core.reconstruct.mast3r.images import Preparation, plan_preparation
 from specimap.core.reconstruct.mast3r.maps import depth_maps
-from specimap.core.reconstruct.mast3r.metric import Predicted, hold_to_markers, network_lens
+from specimap.core.reconstruct.mast3r.metric import Predicted, as_predicted, hold_to_markers, network_lens
 from specimap.core.reconstruct.mast3r.settings import (
     NAME,
     Mast3rSettings,
@@ -87,7 +87,7 @@ class Mast3rBackend:
         placed = place_by_markers(lens, poses, corners, [p.name for p in photos], settings.edge_mm)
         metric = hold_to_markers(
             lens, placed, corners, predicted, plan, chosen.confidence, edge_mm=settings.edge_mm, seed=settings.seed
-        )  # fmt: skip
+        ) if settings.hold_to_markers else as_predicted(lens, placed, predicted)  # fmt: skip
         used = tuple(p for p in range(len(photos)) if p not in placed.foreign)
         if len(used) < LEAST_PHOTOS:
             raise TooFewPhotosError(
@@ -100,7 +100,7 @@ class Mast3rBackend:
         kept = tuple(metric.poses[p] for p in used)
         seen_lens = network_lens(metric.lens, plan)
         maps = depth_maps(predicted, used, metric, seen_lens, images, chosen.confidence)
-        without = [photos[p].name for p in used if metric.fits[p] is None]
+        without = [photos[p].name for p in used if metric.depths[p] is None]
         progress(1.0)
         return Reconstruction(
             used, metric.lens, kept, maps, sparse_points(list(maps), kept), refused,

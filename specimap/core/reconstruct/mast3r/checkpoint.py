@@ -122,14 +122,17 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
             warnings.simplefilter("ignore")
             stored = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
-        if "Unsupported" in str(error) or "GLOBAL" in str(error):
+        # Of torch's text the reason alone is told: the rest advises to load the file unsafely.
+        code = re.search(r"GLOBAL ([\w.]+)", str(error))
+        if code:
             raise BackendUnavailableError(
                 f"The weights file {path.name} holds code, not only weights; it was not run.",
                 advice="Get the checkpoint from its publisher.",
                 reason="weights_unsafe",
-                found=str(error).splitlines()[0][:300],
+                found=code[1][:300],
             ) from error
-        _refuse(f"it does not read ({str(error).splitlines()[0][:200]})", error)
+        reason = str(error).partition("WeightsUnpickler error:")[2].strip().partition("\n")[0]
+        _refuse(f"it does not read ({(reason or type(error).__name__)[:200]})", error)
     except Exception as error:
         # Not a list of types: on a file that is no checkpoint the reader raises anything, IndexError included.
         _refuse(f"it does not read ({type(error).__name__}: {str(error)[:200]})", error)

@@ -35,13 +35,13 @@ def depth_maps(
     straight = replace(lens, k1=0.0, k2=0.0)
     maps = []
     for place, photo in enumerate(used):
-        fit, pose = metric.fits[photo], metric.poses[photo]
-        if fit is None:
+        known, pose = metric.depths[photo], metric.poses[photo]
+        if known is None:
             continue
         confidence = predicted.confidence[photo]
-        sure = np.where(confidence > least_confidence, predicted.depth[photo], np.float32(0))
+        sure = np.where(confidence > least_confidence, known, np.float32(0))
         depth, certain, colour = undistorted(
-            lens, fit.apply(sure), bytes_of(confidence, least_confidence), images[photo]
+            lens, sure, bytes_of(confidence, least_confidence), images[photo]
         )
         depth = inside_volume(depth, straight, pose.R, pose, volume)
         found = cropped_map(place, np.eye(3), straight, depth, colour, certain)

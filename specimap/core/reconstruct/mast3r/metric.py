@@ -1,9 +1,9 @@
-"""MASt3R's cameras and depths held to the markers: one lens, poses and a scale for each photo's depth.
+"""MASt3R's cameras and depths in millimetres: held to the markers, or as predicted.
 
 MASt3R leaves focal length and distance uncertain together. Applying poses that were refined on the corners, with
 another focal length, to depth that was found with MASt3R's own puts that depth in the wrong place: measured with exact
-predictions, half a millimetre for a focal length 0.1 % off. So cameras are adjusted here, and each photo's depth is
-fitted to what the adjusted markers say of it.
+predictions, 1.4 mm for a focal length 1 % off. So by default cameras are adjusted here, and each photo's depth is
+fitted to what the adjusted markers say of it. As published, neither is touched, and stage 2 keeps the focal length too.
 """
 
 from __future__ import annotations
@@ -38,12 +38,24 @@ class Predicted:
 @dataclass(frozen=True)
 class Metric:
     """``lens``: the photos' shared lens; ``poses``: ``cam_from_world`` of all photos in the marker frame, mm;
-    ``corners`` (Q, 4, 3) mm; ``fits``: what brings each photo's depth to mm, None where nothing does."""
+    ``corners`` (Q, 4, 3) mm; ``depths``: each photo's (H, W) mm, None where nothing brings it there."""
 
     lens: Intrinsics
     poses: tuple[Pose, ...]
     corners: Floats
-    fits: tuple[Alignment | None, ...]
+    depths: tuple[Singles | None, ...]
+
+
+def as_predicted(lens: Intrinsics, placed: Placed, predicted: Predicted) -> Metric:
+    """Cameras and depths as they are, but for frame and scale: as published, stage 2 then adjusts the poses alone.
+
+    A photo that the markers had to place keeps no depth.
+    """
+    depths = tuple(
+        None if photo in placed.resected else depth * np.float32(placed.scale)
+        for photo, depth in enumerate(predicted.depth)
+    )
+    return Metric(lens, placed.poses, placed.corners, depths)
 
 
 def hold_to_markers(
@@ -83,7 +95,8 @@ def hold_to_markers(
             poses[photo], fits[photo] = _located(
                 photo, placed, predicted, sure, network, poses[photo], move, keep_pose=marked, seed=seed
             )
-    return Metric(adjusted.lens, tuple(poses), adjusted.corners, tuple(fits))
+    depths = tuple(fit.apply(depth) if fit else None for fit, depth in zip(fits, predicted.depth, strict=True))
+    return Metric(adjusted.lens, tuple(poses), adjusted.corners, depths)
 
 
 def network_lens(lens: Intrinsics, plan: Preparation) -> Intrinsics:
