@@ -84,6 +84,22 @@ def test_a_photo_is_located_however_it_was_held(low: Ring, aliked: FeatureKind, 
 
 
 @needs_aliked
+def test_fused_attention_computes_what_the_package_does() -> None:
+    torch = importlib.import_module("torch")
+    fused = importlib.import_module("specimap.core.reconstruct.attention").FusedCross
+    package = importlib.import_module("specimap.core.reconstruct.aliked")._package()
+    block = sys.modules[package.LightGlue.__module__].CrossBlock(32, 4, True)
+    rng = np.random.default_rng(0)
+    x0, x1 = (torch.from_numpy(rng.standard_normal((1, n, 32)).astype(np.float32)) for n in (50, 70))
+    with torch.inference_mode():
+        for own, theirs, given in zip(fused(block)(x0, x1), block(x0, x1), (x0, x1), strict=True):
+            assert (own - given).abs().max() > 0.01
+            assert (own - theirs).abs().max() < 1e-4
+        with pytest.raises(ValueError, match="mask"):
+            fused(block)(x0, x1, torch.ones(1, 50, 70))
+
+
+@needs_aliked
 def test_turning_there_and_back() -> None:
     module = importlib.import_module("specimap.core.reconstruct.aliked")
     xy = np.random.default_rng(0).uniform(0, 50, (20, 2))

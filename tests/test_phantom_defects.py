@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scenes import SMALL
@@ -80,6 +81,32 @@ def test_a_motion_out_of_range_is_refused(change: dict[str, object]) -> None:
     with pytest.raises(SettingsError) as refused:
         replace(STILL, **change)  # type: ignore[arg-type]
     assert refused.value.details["setting"] == "moved_mm"
+
+
+def test_a_bare_photo_shows_the_same_scene_without_cards(still: Phantom) -> None:
+    bare = Phantom(replace(STILL, bare_photos=(1,)))
+    (_, same), (_, without) = bare.photos()
+    (_, first), (_, with_cards) = still.photos()
+    np.testing.assert_array_equal(same, first)
+    outlines = still.scene.cards.outlines
+    assert bare.truth.marker_corners.tolist() == still.truth.marker_corners.tolist()
+    on_card = np.zeros(without.shape[:2], np.uint8)
+    for outline in outlines:
+        cv2.fillConvexPoly(on_card, np.rint(still.views[1].project(outline)).astype(np.int32), 1)
+    changed = (without != with_cards).any(-1)
+    around = cv2.dilate(on_card, np.ones((5, 5), np.uint8)) > 0
+    assert not changed[~around].any()
+    assert changed[on_card > 0].mean() > 0.8
+    # Where cards lay, the picture is as bright and as even as the tray beside them.
+    beside = (cv2.dilate(on_card, np.ones((9, 9), np.uint8)) > 0) & ~around
+    assert abs(np.median(without[on_card > 0]) - np.median(without[beside])) < 10
+    assert without[on_card > 0].std() < 1.5 * without[beside].std() < 0.7 * with_cards[on_card > 0].std()
+
+
+def test_bare_photos_are_among_those_taken() -> None:
+    with pytest.raises(SettingsError) as refused:
+        replace(STILL, bare_photos=(2,))
+    assert refused.value.details["setting"] == "bare_photos"
 
 
 class StopError(Exception):

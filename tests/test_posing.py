@@ -77,7 +77,8 @@ def test_sift_locates_what_markers_leave_open(scene: Ring, monkeypatch: pytest.M
     ((code, sentence),) = posed.remarks
     assert code == "features_chosen"
     assert "6 of 10 photos" in sentence
-    assert "SIFT located 6 of 6" in sentence
+    assert "% of the picture between the markers shows fine texture above the noise" in sentence
+    assert "SIFT, tried first and taken where 60 matches agree, located 6 of 6" in sentence
 
 
 def test_auto_goes_on_where_sift_gives_up(scene: Ring, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -86,8 +87,34 @@ def test_auto_goes_on_where_sift_gives_up(scene: Ring, monkeypatch: pytest.Monke
     posed = pose(scene, scene.shown_in(SHOWN))
     assert asked == ["sift", "aliked"]
     assert posed.photos == tuple(ALL)
-    assert "SIFT located 0 of 6" in posed.remarks[0][1]
-    assert "ALIKED with LightGlue located 6 of 6" in posed.remarks[0][1]
+    assert "SIFT, tried first and taken where 60 matches agree, located 0 of 6" in posed.remarks[0][1]
+    assert "ALIKED with LightGlue, for the rest, located 6 of 6" in posed.remarks[0][1]
+
+
+@pytest.mark.parametrize("second", [Sift, Blind])
+def test_auto_takes_a_pose_of_few_matches_only_where_aliked_finds_none(
+    scene: Ring, monkeypatch: pytest.MonkeyPatch, second: type[Sift]
+) -> None:
+    installed(monkeypatch)
+    monkeypatch.setattr(reaching, "SURE_INLIERS", 10_000)
+    asked = kinds_are(monkeypatch, sift=Sift, aliked=second)
+    posed = pose(scene, scene.shown_in(SHOWN))
+    assert asked == (["sift", "aliked"] if second is Sift else ["sift", "aliked", "sift"])
+    assert posed.photos == tuple(ALL)
+    assert ("SIFT, now with fewer matches, located 6 of 6" in posed.remarks[0][1]) == (second is Blind)
+    assert scene.errors_deg(posed.photos, posed.poses, posed.corners, [0, 1, 2, 3]).max() < 2
+
+
+def test_without_aliked_a_pose_of_few_matches_is_taken_at_once(
+    scene: Ring, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    installed(monkeypatch, "torch")
+    monkeypatch.setattr(reaching, "SURE_INLIERS", 10_000)
+    asked = kinds_are(monkeypatch, sift=Sift)
+    posed = pose(scene, scene.shown_in(SHOWN))
+    assert asked == ["sift"]
+    assert posed.photos == tuple(ALL)
+    assert "SIFT, tried first, located 6 of 6" in posed.remarks[0][1]
 
 
 def test_sift_alone_does_not_go_on(scene: Ring, monkeypatch: pytest.MonkeyPatch) -> None:

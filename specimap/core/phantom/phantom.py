@@ -14,7 +14,7 @@ from specimap.core.colour import srgb_from_linear
 from specimap.core.geometry import View
 from specimap.core.phantom import materials
 from specimap.core.phantom.render import CLASS_SPECIMEN, Paint, Rendering, render_view
-from specimap.core.phantom.scene import Scene, build_scene
+from specimap.core.phantom.scene import Scene, build_scene, without_cards
 from specimap.core.phantom.settings import PhantomSettings, Stream
 from specimap.core.phantom.specimen import displacement
 from specimap.core.phantom.truth import Truth
@@ -44,8 +44,10 @@ class Phantom:
     def photos(self) -> Generator[tuple[str, NDArray[np.uint8]]]:
         """Name and upright RGB image (H, W, 3) of each photo, in order."""
         paint = Paint.of(self.scene, materials.linear_rgb())
+        bare = without_cards(self.scene) if self.settings.bare_photos else self.scene
+        scenes = [bare if i in self.settings.bare_photos else self.scene for i in range(self.settings.photos)]
         with ThreadPoolExecutor(_THREADS) as pool:
-            images = pool.map(lambda i: self._photo(i, paint), range(self.settings.photos))
+            images = pool.map(lambda i: self._photo(i, scenes[i], paint), range(self.settings.photos))
             try:
                 for i, image in enumerate(images):
                     yield f"view_{i:03d}", image
@@ -53,10 +55,10 @@ class Phantom:
                 # Whoever stops early does not wait for the photos that are left.
                 pool.shutdown(wait=False, cancel_futures=True)
 
-    def _photo(self, index: int, paint: Paint) -> NDArray[np.uint8]:
+    def _photo(self, index: int, scene: Scene, paint: Paint) -> NDArray[np.uint8]:
         s = self.settings
         rng = s.rng(Stream.PHOTO, index)
-        linear = render_view(self.scene, self.views[index], paint, gloss=s.gloss).image
+        linear = render_view(scene, self.views[index], paint, gloss=s.gloss).image
         if s.blur_px:
             linear = cv2.GaussianBlur(linear, (0, 0), s.blur_px)
         linear = linear * np.float32(2 ** (s.exposure_spread * rng.standard_normal()))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -129,8 +129,7 @@ def build_scene(settings: PhantomSettings, moved: Pose | None = None) -> Scene:
         specimen = displaced(specimen, moved)
     cards = place_cards(settings)
     half = settings.scene_mm + 28
-    quads = [cards.outlines, _square(half, TRAY_Z_MM), _square(_BENCH_HALF_MM, BENCH_Z_MM)]
-    caster = RayCaster([(specimen.vertices, specimen.triangles), *map(_quad_mesh, quads)])
+    caster = _caster(specimen, cards.outlines, half)
     # Only the specimen casts shadows: a card a fraction of a millimetre high has none worth rendering.
     shade = RayCaster([(specimen.vertices, specimen.triangles)])
     lights, weights = sky()
@@ -145,6 +144,18 @@ def build_scene(settings: PhantomSettings, moved: Pose | None = None) -> Scene:
         tray_maps=_tray_maps(settings, shade, half, lights, weights),
         moved=moved,
     )
+
+
+def without_cards(scene: Scene) -> Scene:
+    """The same scene, its cards out of sight under the bench."""
+    under = scene.cards.outlines - [0, 0, scene.cards.outlines[..., 2].max() - BENCH_Z_MM + 1]
+    return replace(scene, caster=_caster(scene.specimen, under, scene.tray_half_mm))
+
+
+def _caster(specimen: Specimen, outlines: Floats, half: float) -> RayCaster:
+    """Geometries in the order of their numbers."""
+    quads = [outlines, _square(half, TRAY_Z_MM), _square(_BENCH_HALF_MM, BENCH_Z_MM)]
+    return RayCaster([(specimen.vertices, specimen.triangles), *map(_quad_mesh, quads)])
 
 
 def marker_cells(dictionary: str, marker_id: int) -> NDArray[np.bool_]:

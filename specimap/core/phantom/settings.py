@@ -66,6 +66,8 @@ class PhantomSettings:
     """Sd of the exposure in stops from photo to photo."""
     noise: float = 1.5 / 255
     """Sd of the photos' noise; encoded full scale is 1."""
+    bare_photos: tuple[int, ...] = ()
+    """Photos that show no card: in them the specimen lies on the tray alone."""
 
     # ---- cube ----
     cube_rows: int = 512
@@ -110,6 +112,10 @@ class PhantomSettings:
         if not self.marker_ids or len(set(self.marker_ids)) != len(self.marker_ids):
             raise SettingsError(
                 "marker_ids must hold distinct ids.", advice="List each id once.", setting="marker_ids"
+            )
+        if not set(self.bare_photos) <= set(range(self.photos)):
+            raise SettingsError(
+                "bare_photos names photos that are not taken.", advice=_ADVICE, setting="bare_photos"
             )
         if not 0 < self.wavelength_nm[0] < self.wavelength_nm[1]:
             raise SettingsError(

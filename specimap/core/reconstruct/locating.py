@@ -48,7 +48,10 @@ class Located:
 
 
 class Locator:
-    """Locates photos against those already posed. ``tick`` is called between steps and may raise to stop."""
+    """Locates photos against those already posed. ``tick`` is called between steps and may raise to stop.
+
+    ``least_inliers``: how many matches must agree on a pose, where that is more than the kind of features asks for.
+    """
 
     def __init__(
         self,
@@ -59,6 +62,8 @@ class Locator:
         seed: int,
         kind: FeatureKind,
         tick: Tick = lambda: None,
+        *,
+        least_inliers: int = 0,
     ) -> None:
         self._photos = photos
         self._lens = lens
@@ -66,6 +71,7 @@ class Locator:
         self._seed = seed
         self._kind = kind
         self._tick = tick
+        self._least_inliers = max(kind.least_inliers, least_inliers)
         self._features: dict[Seen, Features] = {}
         self._turn: dict[int, int] = {}  # of posed photos that were found turned
         self._places: dict[int, Floats] = {}  # photo -> (N, 3), NaN where a feature has no place
@@ -185,7 +191,7 @@ class Locator:
             xy.append(features.xy[pairs[placed, 0]])
             places.append(at[placed])
         points_2d, points_3d = np.concatenate(xy), np.concatenate(places)
-        if len(points_2d) < self._kind.least_inliers:
+        if len(points_2d) < self._least_inliers:
             return None
         pycolmap.set_random_seed(self._seed)
         options = pycolmap.AbsolutePoseEstimationOptions()
@@ -198,7 +204,7 @@ class Locator:
         if answer is None:
             return None
         inliers = int(answer["num_inliers"])
-        if inliers < self._kind.least_inliers or inliers < self._kind.least_share * len(points_2d):
+        if inliers < self._least_inliers or inliers < self._kind.least_share * len(points_2d):
             return None
         matrix = answer["cam_from_world"].matrix()
         pose = Pose(matrix[:, :3].copy(), matrix[:, 3].copy())

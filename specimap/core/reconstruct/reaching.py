@@ -1,7 +1,8 @@
 """Photos that markers leave open: which features locate them, and in which order.
 
-``auto`` begins with SIFT, which is cheap, and goes on with ALIKED only for photos that SIFT leaves open, where ALIKED
-is installed. The report says so, but only where features were needed at all.
+``auto`` begins with SIFT, which is cheap and, where much of it matches, the more accurate. Where ALIKED is installed,
+a pose that few of SIFT's matches agree on is not taken: ALIKED comes next, and then SIFT as far as it goes. The report
+says so, with the specimen's texture, but only where features were needed at all.
 """
 
 from __future__ import annotations
@@ -18,10 +19,15 @@ from specimap.core.reconstruct.backend import CornersInPhotos, ReconstructSettin
 from specimap.core.reconstruct.features import aliked_missing, feature_kind
 from specimap.core.reconstruct.locating import Locator
 from specimap.core.reconstruct.motion import Motion, structure_from_motion
+from specimap.core.reconstruct.texture import between_markers, in_words, usual_share
 
 SAME_POSE_DEG = 8.0
+SURE_INLIERS = 60
+"""Matches that must agree on a pose by SIFT where ALIKED could have a try: with fewer, where glistening tissue was all
+that photos shared, poses were off by up to 7 degrees."""
 REMARK = "features_chosen"
 NAMES = {"sift": "SIFT", "aliked": "ALIKED with LightGlue"}
+ABSENT = "ALIKED, which may locate more, is not installed."
 
 Share = Callable[[float], None]
 
@@ -54,33 +60,42 @@ def reach_by_places(
     # The specimen lies inside the layout, about a fifth of its size above the plane.
     target = corners.reshape(-1, 3).mean(0) + np.array([0, 0, 0.1 * np.ptp(corners[..., 0])])
     poses, open_photos = dict(sure), list(waiting)
-    said = [f"{len(waiting)} of {len(photos)} photos were not posed by markers alone."]
+    seen = [(photos[p], between_markers(lens, pose, corners, photos[p].size)) for p, pose in sorted(sure.items())]
+    texture = in_words(usual_share(seen), "the picture between the markers")
+    said = [f"{len(waiting)} of {len(photos)} photos were not posed by markers alone.", texture]
 
     def tick() -> None:
         progress(1 - len(open_photos) / len(waiting))
 
-    def by(name: str) -> None:
+    def by(name: str, why: str, least_inliers: int = 0) -> None:
         before = len(open_photos)
-        locator = Locator(photos, lens, poses, target, settings.seed, feature_kind(name, workers), tick)
+        kind = feature_kind(name, workers)
+        locator = Locator(photos, lens, poses, target, settings.seed, kind, tick, least_inliers=least_inliers)
         _walk(locator, open_photos, either)
         poses.update(locator.poses)
         found, placed = locator.counts()
         said.append(
-            f"{NAMES[name]} located {before - len(open_photos)} of {before} (median {np.median(found or [0]):.0f} "
+            f"{NAMES[name]}{why} located {before - len(open_photos)} of {before} (median {np.median(found or [0]):.0f} "
             f"features in a photo, {np.median(placed or [0]):.0f} of them placed in space)."
         )
 
-    by("aliked" if settings.features == "aliked" else "sift")
-    if settings.features == "auto" and open_photos:
-        _try_learned(lambda: by("aliked"), said)
+    if settings.features != "auto":
+        by(settings.features, ", as asked,")
+    elif aliked_missing():
+        by("sift", ", tried first,")
+        if open_photos:
+            said.append(ABSENT)
+    else:
+        by("sift", f", tried first and taken where {SURE_INLIERS} matches agree,", SURE_INLIERS)
+        if open_photos:
+            _unasked(lambda: by("aliked", ", for the rest,"), said)
+        if open_photos:
+            by("sift", ", now with fewer matches,")
     return Reached(poses, ((REMARK, " ".join(said)),))
 
 
-def _try_learned(attempt: Callable[[], None], said: list[str]) -> None:
-    """Go on with ALIKED, unasked: where it is not to be had, that is only said."""
-    if aliked_missing():
-        said.append("ALIKED, which may locate more, is not installed.")
-        return
+def _unasked(attempt: Callable[[], None], said: list[str]) -> None:
+    """Go on with ALIKED, unasked: where it does not load, that is only said."""
     try:
         attempt()
     except BackendUnavailableError as error:
@@ -143,7 +158,8 @@ def reach_by_motion(
     Returns poses, lens and corners; None where photos do not hang together, or show no marker twice.
     """
     kept = [p for p in range(len(photos)) if p not in left_out]
-    said = [f"Markers pose too few of {len(photos)} photos: poses come from image features."]
+    texture = in_words(usual_share((photos[p], None) for p in kept), "the photos")
+    said = [f"Markers pose too few of {len(photos)} photos: poses come from image features.", texture]
     steps = 0
 
     def tick() -> None:
@@ -166,7 +182,10 @@ def reach_by_motion(
 
     by("aliked" if settings.features == "aliked" else "sift")
     if settings.features == "auto" and (best is None or len(best.poses) < len(kept)):
-        _try_learned(lambda: by("aliked"), said)
+        if aliked_missing():
+            said.append(ABSENT)
+        else:
+            _unasked(lambda: by("aliked"), said)
     if best is None:
         return None
     placed = best.in_marker_frame(corners.seen, len(corners.marker_ids), settings.edge_mm)
