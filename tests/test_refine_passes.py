@@ -58,7 +58,8 @@ def test_vertices_that_are_not_worth_it_keep_their_places() -> None:
     moved = np.linalg.norm(after.mesh.vertices - scene.mesh.vertices, axis=1)[worth]
     assert (moved > 0).mean() > 0.95
     assert not after.views[~worth].any()
-    assert np.isnan(after.unsettled_mm[~worth]).all()
+    assert np.isnan(after.agreement[~worth]).all()
+    assert np.isnan(after.sharpness[~worth]).all()
     assert np.array_equal(after.mesh.triangles, scene.mesh.triangles)
     assert np.array_equal(after.mesh.colours, scene.mesh.colours)
     # No pass may carry a vertex beyond what all of them together reach.
@@ -75,29 +76,31 @@ def test_what_is_not_worth_it_changes_nothing_within_the_rest() -> None:
     assert np.median(apart) < LEAST_SIGMA_MM
 
 
-def test_views_and_what_is_left_unsettled_are_told() -> None:
+def test_views_and_how_they_agree_are_told() -> None:
     scene = matched(SEEDS[0])
     after = refined(scene, worth=scene.worth)
     views = after.views[scene.worth]
     assert views.max() == 9
     assert views.max() <= len(scene.images)
     assert (views >= 3).mean() > 0.9
-    unsettled = after.unsettled_mm[scene.worth]
-    assert np.isfinite(unsettled).all()
-    assert (unsettled >= 0).all()
-    # Within the last pass' reach, since its own best and its smoothed offset both are.
-    assert 1e-4 < np.median(unsettled) < SETTINGS.passes[-1].reach_voxels * scene.voxel_mm
-    assert unsettled.max() <= 2 * SETTINGS.passes[-1].reach_voxels * scene.voxel_mm
+    agreement, sharpness = after.agreement[scene.worth], after.sharpness[scene.worth]
+    assert agreement.max() <= 1
+    assert 0.5 < np.median(agreement) < 0.99
+    assert np.isfinite(sharpness).all()
+    assert (sharpness >= 0).all()
+    # Patches agree within about a photo's pixel on either side of the surface.
+    pixel_mm = pixel_footprint_mm(scene.lens, scene.poses, scene.volume.centre)
+    assert 0.3 * pixel_mm < 1 / np.sqrt(np.median(sharpness)) < 5 * pixel_mm
 
 
-def test_unsettled_places_are_the_worse_ones() -> None:
+def test_places_where_agreement_is_sharp_are_the_better_ones() -> None:
     scene = matched(SEEDS[0])
     after = refined(scene, worth=scene.worth)
     of = tissue(scene)
-    off, unsettled = np.abs(scene.off_mm(after.mesh)[of]), after.unsettled_mm[of]
-    low, high = np.percentile(unsettled, [25, 75])
-    calm, restless = np.nanmedian(off[unsettled <= low]), np.nanmedian(off[unsettled >= high])
-    assert calm < restless
+    off, sharpness = np.abs(scene.off_mm(after.mesh)[of]), after.sharpness[of]
+    low, high = np.percentile(sharpness, [25, 75])
+    dull, sharp = np.nanmedian(off[sharpness <= low]), np.nanmedian(off[sharpness >= high])
+    assert sharp < dull
 
 
 def test_no_more_views_than_asked_for_are_compared() -> None:
@@ -111,7 +114,7 @@ def test_nothing_worth_it_leaves_the_mesh_alone() -> None:
     after = refined(scene, worth=np.zeros(len(scene.mesh.vertices), bool))
     assert after.mesh is scene.mesh
     assert not after.views.any()
-    assert np.isnan(after.unsettled_mm).all()
+    assert np.isnan(after.sharpness).all()
 
 
 def test_blank_photos_leave_the_mesh_alone() -> None:

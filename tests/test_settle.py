@@ -32,8 +32,6 @@ ROWS, COLS = VIEW.intrinsics.height, VIEW.intrinsics.width
 SHARP_PX, BLURRED_PX = 0.02, 0.5
 ALL, THREE = (0, 1, 2, 3), (0, 1, 2)
 SEEDS = range(8)
-STATED_MM = float(np.hypot(SHARED_MM, SHARED_MM))
-"""What is stated of a camera settled by a specimen with rich texture: the tiles' share and the surface's."""
 RAISED_MM = 1.5
 MOVED_MM = (0.8, -0.5, 0.0)
 COVER = 5000
@@ -146,17 +144,17 @@ def test_an_anchor_holds_the_camera_where_it_is_known() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_four_sharp_markers_are_enough(caster: RayCaster, picture: Image, seed: int) -> None:
+def test_four_sharp_markers_hold_the_camera_and_the_specimen_agrees(
+    caster: RayCaster, picture: Image, seed: int
+) -> None:
     found = case(picture, caster, ALL, SHARP_PX, seed)
     settled = found.settled
-    assert np.array_equal(settled.camera.view.cam_from_world.matrix, found.alone.view.cam_from_world.matrix)
-    assert settled.camera.view.intrinsics == found.alone.view.intrinsics
-    assert not settled.by_specimen
+    assert settled.by_specimen
     assert settled.remarks() == []
     assert settled.shift is not None
     assert not settled.shift.significant
     assert 0 < settled.sideways_mm < settled.open_mm < LOOSE_MM
-    assert 0.001 < found.after_mm < 2 * settled.open_mm
+    assert 0.001 < found.after_mm < 2 * settled.sideways_mm
 
 
 @pytest.mark.parametrize("ids", [ALL, THREE])
@@ -165,13 +163,15 @@ def test_what_markers_leave_open_the_specimen_settles(caster: RayCaster, picture
     # Corners that are off by chance hide at times how far: not every draw is recognised as loose.
     assert len(cases) >= 6
     for found in cases:
-        assert found.settled.open_mm > LOOSE_MM
-        assert found.after_mm < min(found.before_mm, 3 * STATED_MM)
-        assert found.settled.sideways_mm == pytest.approx(STATED_MM, rel=0.1)
-        assert found.settled.remarks() == []
+        settled = found.settled
+        assert settled.shift is not None
+        assert found.after_mm < min(found.before_mm, 3 * settled.shift.sigma_mm)
+        # Two measurements of one place are together surer than either.
+        assert SHARED_MM / 2 < settled.sideways_mm < min(settled.open_mm, settled.shift.sigma_mm)
+        assert settled.remarks() == []
     before, after = (float(np.median(m)) for m in zip(*((c.before_mm, c.after_mm) for c in cases), strict=True))
     assert before > LOOSE_MM
-    assert 0.002 < after < STATED_MM
+    assert 0.002 < after < 2 * SHARED_MM
 
 
 def test_what_nothing_settles_is_said(caster: RayCaster, picture: Image) -> None:
@@ -255,7 +255,8 @@ def test_a_run_with_two_markers_in_the_cube_is_settled(finished: Finished, small
     assert not codes(report) & {"specimen_moved", "cube_camera_loose"}
     before, after, settled = resolved(tmp_path)
     assert settled.by_specimen
-    assert 0.003 < after < min(before, 3 * STATED_MM)
+    assert settled.shift is not None
+    assert 0.003 < after < min(before, 3 * settled.shift.sigma_mm)
     assert report.cube_camera.focal_px == pytest.approx(settled.camera.view.intrinsics.focal_px, rel=1e-3)
     # Half the markers, and the places are about as good as with all of them.
     error, usual = judge_with_sigma(tmp_path / "out", tmp_path).errors, judge(finished.out, small.folder)
@@ -295,5 +296,6 @@ def test_a_run_on_blurred_photos_is_settled(blurred: tuple[Path, Report]) -> Non
     before, after, settled = resolved(folder)
     assert settled.by_specimen
     assert settled.open_mm > LOOSE_MM
-    assert 0.003 < after < min(before, 3 * STATED_MM)
+    assert settled.shift is not None
+    assert 0.003 < after < min(before, 3 * settled.shift.sigma_mm)
     assert 0.3 * after < settled.sideways_mm < LOOSE_MM

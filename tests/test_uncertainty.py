@@ -13,6 +13,8 @@ from specimap.core.refine import Refined, RefineSettings, refine_mesh
 from specimap.core.uncertainty import (
     AGREEMENT_MM,
     LEAST_SIGMA_MM,
+    OF_JUMP,
+    STEEP_MM,
     STEP_REACH_MM,
     UNSEEN_SIGMA_MM,
     mesh_sigma,
@@ -93,21 +95,29 @@ def test_a_point_adds_its_parts_in_squares() -> None:
     surface, step = np.array([0.03, 0.3], np.float32), np.zeros(2, np.float32)
     assert point_sigma(surface, step, 0.0, 0.0) == pytest.approx(surface, rel=1e-6)
     alone = [
-        point_sigma(np.zeros(2, np.float32), np.full(2, 0.5, np.float32), 0.0, 0.0),
+        point_sigma(np.zeros(2, np.float32), np.full(2, 2.5, np.float32), 0.0, 0.0),
         point_sigma(surface, step, 0.0, 0.0),
         point_sigma(np.zeros(2, np.float32), step, 0.04, 0.0),
         point_sigma(np.zeros(2, np.float32), step, 0.0, 0.07),
     ]
-    together = point_sigma(surface, np.full(2, 0.5, np.float32), 0.04, 0.07)
+    together = point_sigma(surface, np.full(2, 2.5, np.float32), 0.04, 0.07)
     assert together == pytest.approx(np.sqrt(sum(a.astype(float) ** 2 for a in alone)), rel=1e-5)
     assert all((a > 0).all() for a in alone)
     assert together.dtype == np.float32
 
 
+def test_a_flank_is_no_jump() -> None:
+    surface = np.full(3, 0.05, np.float32)
+    step = np.array([0.0, STEEP_MM, STEEP_MM + 0.4], np.float32)
+    flat, flank, jump = point_sigma(surface, step, 0.0, 0.0).tolist()
+    assert flank == pytest.approx(flat)
+    assert jump == pytest.approx(np.hypot(0.05, 0.4 * OF_JUMP), rel=1e-4)
+
+
 @pytest.mark.parametrize("part", range(4))
 def test_no_part_makes_a_point_surer(part: int) -> None:
     before: np.float32 | None = None
-    for value in np.linspace(0, 2, 9):
+    for value in np.linspace(0, 2, 9) + (STEEP_MM if part == 1 else 0):
         parts = [0.05, 0.3, 0.02, 0.01]
         parts[part] = float(value)
         surface, step = (np.array([p], np.float32) for p in parts[:2])
@@ -138,17 +148,28 @@ def test_stated_and_true_errors_of_a_mesh_go_together(after: Refined) -> None:
     assert np.nanmedian(off[stated <= low]) < np.nanmedian(off[stated >= high])
 
 
-def test_fewer_views_and_more_disagreement_make_a_mesh_less_sure(after: Refined) -> None:
+def test_fewer_views_and_less_agreement_make_a_mesh_less_sure(after: Refined) -> None:
     scene = matched(SEED)
-    done = (after.views > 0) & np.isfinite(after.unsettled_mm)
+    done = (after.views > 0) & np.isfinite(after.sharpness)
     plain = mesh_sigma(after, scene.maps, scene.poses)
     fewer = replace(after, views=np.where(done, 3, 0).astype(np.uint8))
     all_views = replace(after, views=np.where(done, 9, 0).astype(np.uint8))
     assert (mesh_sigma(fewer, scene.maps, scene.poses) >= mesh_sigma(all_views, scene.maps, scene.poses)).all()
-    restless = replace(after, unsettled_mm=after.unsettled_mm + np.float32(0.1))
-    louder = mesh_sigma(restless, scene.maps, scene.poses)
-    assert (louder >= plain).all()
-    assert (louder[done] > plain[done]).mean() > 0.9
+    for doubtful in (
+        replace(after, agreement=after.agreement - np.float32(0.2)),
+        replace(after, sharpness=after.sharpness / np.float32(2)),
+    ):
+        louder = mesh_sigma(doubtful, scene.maps, scene.poses)
+        assert (louder >= plain).all()
+        assert (louder[done] > plain[done]).mean() > 0.9
+
+
+def test_photos_that_agree_on_nothing_leave_the_scatter_of_the_depths(after: Refined) -> None:
+    scene = matched(SEED)
+    flat = replace(after, sharpness=np.zeros_like(after.sharpness))
+    assert np.array_equal(
+        mesh_sigma(flat, scene.maps, scene.poses), vertex_scatter(after.mesh, scene.maps, scene.poses)
+    )
 
 
 def test_unrefined_vertices_keep_the_scatter_of_the_depths(after: Refined) -> None:

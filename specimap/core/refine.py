@@ -29,13 +29,15 @@ CHUNK = 2048
 class Refined:
     """A refined mesh, and how it came about.
 
-    ``views`` (V,): photos that were compared at a vertex, 0 where none were. ``unsettled_mm`` (V,): how far the
-    vertex's own photos would have it from where its neighbours let it go; NaN where it was not refined.
+    ``views`` (V,): photos that were compared at a vertex, 0 where none were. ``agreement`` (V,): their mean correlation
+    at the best offset. ``sharpness`` (V,), 1/mm^2: how fast it falls off along the normal, its curvature times its
+    height; 0 where it has no top within reach. Both NaN where the vertex was not refined.
     """
 
     mesh: Mesh
     views: NDArray[np.uint8]
-    unsettled_mm: NDArray[np.float32]
+    agreement: NDArray[np.float32]
+    sharpness: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,8 @@ def refine_mesh(
     photographs = Photographs([image.astype(np.float32) for image in images], lens, poses)
     cost = [p.steps * p.views for p in settings.passes]
     count = len(mesh.vertices)
-    refined = Refined(mesh, np.zeros(count, np.uint8), np.full(count, np.nan, np.float32))
+    unknown = np.full(count, np.nan, np.float32)
+    refined = Refined(mesh, np.zeros(count, np.uint8), unknown, unknown)
     for k, one in enumerate(settings.passes):
         done, share = sum(cost[:k]) / sum(cost), cost[k] / sum(cost)
         refined = _refined_once(
@@ -131,9 +134,10 @@ def _refined_once(
     with ThreadPoolExecutor(workers) as pool:
         for done, _ in enumerate(pool.map(run, parts), 1):
             progress(0.2 + 0.7 * done / len(parts))
-    best, weight = _best_offsets(scores, offsets)
-    sure = ((views >= 0).sum(1) >= 3) & (scores.max(1) > settings.least_score)
-    weight = np.where(sure, weight, 0.0)
+    best, sharp = _best_offsets(scores, offsets)
+    top = scores.max(1)
+    sure = ((views >= 0).sum(1) >= 3) & (top > settings.least_score)
+    weight = np.where(sure, sharp, 0.0)
     if not (weight > 0).any():
         return start
     weight = np.minimum(weight / np.median(weight[weight > 0]), 5.0)
@@ -142,17 +146,11 @@ def _refined_once(
     moved = np.zeros(len(mesh.vertices))
     moved[chosen] = _smoothed(offset, trust, mesh.triangles, settings)[chosen]
     vertices = (mesh.vertices + moved[:, None] * mesh.normals).astype(np.float32)
-    compared, unsettled = start.views.copy(), start.unsettled_mm.copy()
-    compared[chosen] = (views >= 0).sum(1)
-    # One vertex's own disagreement is mostly chance; that of a few together tells how well a place is settled.
-    apart = np.zeros(len(moved))
-    apart[chosen] = np.abs(best - moved[chosen])
-    among = np.zeros(len(moved))
-    among[chosen] = 1.0
-    edges = _edges(mesh.triangles, len(moved))
-    unsettled[chosen] = (apart + edges @ apart)[chosen] / (among + edges @ among)[chosen]
+    compared, agreement, sharpness = start.views.copy(), start.agreement.copy(), start.sharpness.copy()
+    compared[chosen], agreement[chosen] = (views >= 0).sum(1), top
+    sharpness[chosen] = sharp / (offsets[1] - offsets[0]) ** 2
     after = Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), mesh.colours)
-    return Refined(after, compared, unsettled)
+    return Refined(after, compared, agreement, sharpness)
 
 
 def _best_offsets(scores: NDArray[np.float32], offsets: Floats) -> tuple[Floats, Floats]:

@@ -1,11 +1,10 @@
 """One standard deviation of a point's position, so that what is stated holds.
 
-What a point's error depends on was looked for on phantoms: how far depth maps scatter about the surface over the
-whole specimen (sharp photos and rich texture give little), how many photos were compared at the place, how
-far its own photos would have it from where its neighbours let it go, and how steep or broken the surface is for the
-cube's camera, which turns a sideways error into a height. The shares of these are such that over six specimens 68 %
-of the errors lie within one and 95 % within two, as nearly as three numbers can bring that about; docs/accuracy.md
-has what came of it on others.
+What a point's error depends on was looked for on phantoms: how fast the photos' agreement falls off along the normal
+(sharp photos and rich texture make it fall fast) and how far it is from perfect, how many photos were compared at the
+place, where the surface breaks off for the cube's camera, which turns a sideways error into a height, and what markers
+and specimen leave open of that camera. The shares of these were set on six specimens, so that 68 % of the errors lie
+within one and 95 % within two; docs/accuracy.md has what came of it on others.
 """
 
 from __future__ import annotations
@@ -31,14 +30,19 @@ LEAST_SIGMA_MM = 0.01
 LEAST_COSINE = 0.15
 """A surface seen more obliquely than this tells little about its height."""
 
-OF_SCATTER = 0.545
-"""Share of the specimen's typical scatter that is left after refinement with all the photos that are compared."""
+OF_WIDTH = 0.13
+"""Standard deviation of a vertex along its normal as a share of the width of the photos' agreement there, where they
+agree perfectly and all that can be are compared."""
+OF_DISAGREEMENT = 0.55
+"""By how much more of itself it is larger where they do not agree at all."""
 MOST_VIEWS = 9
-OF_UNSETTLED = 2.0
-"""How much farther off a vertex is than its photos and its neighbours disagree by."""
-OF_STEP = 0.12
-"""Share of the surface's step within a cube pixel's reach that a sideways error turns into height."""
+MOST_UNLIKE = 16.0
+"""A vertex counts as at most this much sharper or less sharp than is usual: beyond, its own figure is chance."""
+OF_JUMP = 0.65
+"""Share of a jump of the surface within a cube pixel's reach that a sideways error turns into height."""
 STEP_REACH_MM = 0.17
+STEEP_MM = 2 * STEP_REACH_MM * float(np.tan(np.radians(60)))
+"""A flank of 60 degrees rises by so much within the reach; what is more is a jump."""
 
 
 def mesh_sigma(
@@ -46,16 +50,17 @@ def mesh_sigma(
 ) -> NDArray[np.float32]:
     """Standard deviation (V,) mm of a refined mesh's vertices."""
     scatter = vertex_scatter(refined.mesh, maps, poses, workers=workers)
-    done = (refined.views > 0) & np.isfinite(refined.unsettled_mm)
-    measured = done & (scatter < UNSEEN_SIGMA_MM)
-    if not measured.any():
+    done = (refined.views > 0) & np.isfinite(refined.sharpness)
+    if not (refined.sharpness[done] > 0).any():
         return scatter
-    typical = float(np.median(scatter[measured]))
-    fewer = np.sqrt(MOST_VIEWS / np.maximum(refined.views[done], 1))
+    # Where no depth map sees the place, what the photos agree on may be anything.
+    measured = done & (scatter < UNSEEN_SIGMA_MM)
+    usual = float(np.median(refined.sharpness[done & (refined.sharpness > 0)]))
+    sharpness = np.clip(refined.sharpness[measured], usual / MOST_UNLIKE, usual * MOST_UNLIKE)
+    fewer = MOST_VIEWS / np.maximum(refined.views[measured], 1)
     sigma = scatter.copy()
-    sigma[done] = np.hypot(OF_SCATTER * typical * fewer, OF_UNSETTLED * refined.unsettled_mm[done])
-    # No depth map saw the place: what the photos agree on there may be anything.
-    sigma[done & ~measured] = UNSEEN_SIGMA_MM
+    apart = 1 + OF_DISAGREEMENT * (1 - np.clip(refined.agreement[measured], 0, 1))
+    sigma[measured] = OF_WIDTH * apart * np.sqrt(fewer / sharpness)
     return np.clip(sigma, LEAST_SIGMA_MM, UNSEEN_SIGMA_MM).astype(np.float32)
 
 
@@ -132,7 +137,8 @@ def point_sigma(
     corner_sigma_mm: float,
     registration_mm: float,
 ) -> NDArray[np.float32]:
-    """Standard deviation (S,) mm of points: the surface's own, what steps of the surface (:func:`step_height`) make of
-    a sideways error, the layout's, and the registration's."""
+    """Standard deviation (S,) mm of points: the surface's own, what jumps of the surface (:func:`step_height` beyond a
+    flank's) make of a sideways error, the layout's, and the registration's."""
     shared = np.float32(np.hypot(corner_sigma_mm, registration_mm))
-    return np.asarray(np.hypot(np.hypot(surface_sigma, np.float32(OF_STEP) * step_mm), shared), np.float32)
+    jump = np.float32(OF_JUMP) * np.maximum(step_mm - np.float32(STEEP_MM), 0)
+    return np.asarray(np.hypot(np.hypot(surface_sigma, jump), shared), np.float32)

@@ -1,8 +1,9 @@
 """The cube's camera from the markers, and from the specimen where they leave it open.
 
 Sixteen nearly coplanar corners give the plane's place in the cube to a few hundredths of a pixel, but the direction
-of sight and the focal length only as far as perspective shows. Where that is too little for tissue that stands above
-the plane (a marker out of view, blurred corners), the photos' own picture of the specimen decides.
+of sight and the focal length only as far as perspective shows: at the height of a specimen that leaves 0.02 to 0.1 mm
+open, and much more where a marker is out of view or corners are blurred. The photos' own picture of the specimen tells
+where it lies to 0.03 mm; corners and specimen together give the camera, each by its standard deviation.
 """
 
 from __future__ import annotations
@@ -17,13 +18,15 @@ from specimap.core.points import raised_mm
 from specimap.core.raycast import RayCaster
 from specimap.core.register.camera import Anchor, CubeCamera, solve_camera
 from specimap.core.register.cube_markers import CubeMarkers
-from specimap.core.register.motion import LEAST_MARKERS, SHARED_MM, Shift, specimen_shift
+from specimap.core.register.motion import LEAST_MARKERS, Shift, specimen_shift
 
 LOOSE_MM = 0.1
-"""Sideways standard deviation at the specimen from which on the markers' word is not enough."""
+"""Sideways standard deviation at the specimen from which on the result is called loose."""
 EXPLAINED_BY_CAMERA = 3.0
 """A shift within so many standard deviations of the camera is the camera's, not the specimen's."""
 ROUNDS = 3
+SETTLED_MM = 0.01
+"""Rounds end when the specimen moves by less in the cube."""
 SAMPLE = 500
 
 
@@ -54,10 +57,8 @@ class Settled:
     def camera_mm(self) -> float:
         """The camera's part of it."""
         if self.by_specimen and self.shift is not None:
-            return float(np.hypot(self.shift.sigma_mm, SHARED_MM))
-        misfit = self.camera.rms_px * self.camera.pixel_mm
-        # Corners that hold the camera well leave less than their formal share; the misfit itself is of that size.
-        return max(misfit, self.open_mm) if self.open_mm > LOOSE_MM else misfit
+            return self.open_mm * self.shift.sigma_mm / float(np.hypot(self.open_mm, self.shift.sigma_mm))
+        return float(np.hypot(self.camera.rms_px * self.camera.pixel_mm, self.open_mm))
 
     def remarks(self) -> list[tuple[str, str]]:
         """What the report should say of it."""
@@ -86,7 +87,7 @@ def settle_camera(
     if not len(raised):
         return Settled(camera, camera.sideways_mm(flat[0]), False, None)
     sample = raised[:: max(1, len(raised) // SAMPLE)]
-    left_open, settled = camera.sideways_mm(sample), False
+    centre, left_open, settled = sample.mean(0), camera.sideways_mm(sample), False
     markers = len(seen.marker_ids)
 
     def look(camera: CubeCamera, markers: int) -> Shift | None:
@@ -94,15 +95,26 @@ def settle_camera(
             found.image, camera.view, caster, corners, markers_in_cube=markers, mirrored=found.mirrored
         )
 
-    for _ in range(ROUNDS if left_open > LOOSE_MM else 0):
-        # However few the markers: it is the camera that is in question here.
-        shift = look(camera, max(markers, LEAST_MARKERS))
-        if shift is None or shift.moved_mm > EXPLAINED_BY_CAMERA * left_open:
+    # However few the markers: it is the camera that is in question here.
+    shift = look(camera, max(markers, LEAST_MARKERS))
+    for _ in range(ROUNDS):
+        if shift is None or shift.moved_mm > EXPLAINED_BY_CAMERA * np.hypot(left_open, shift.sigma_mm):
             break
-        centre = sample.mean(0)
         across = np.array([*shift.shift_mm, 0.0])
         pixel = camera.view.project((centre + across)[None])[0]
-        sigma_px = max(shift.sigma_mm, SHARED_MM) / camera.pixel_mm
-        camera = solve_camera(*flat, rows, cols, anchor=Anchor(centre, pixel, sigma_px))
+        before, camera = camera, solve_camera(
+            *flat, rows, cols, anchor=Anchor(centre, pixel, shift.sigma_mm / camera.pixel_mm)
+        )
         settled = True
-    return Settled(camera, left_open, settled, look(camera, max(markers, LEAST_MARKERS) if settled else markers))
+        shift = look(camera, max(markers, LEAST_MARKERS))
+        if _apart_mm(before, camera, centre) < SETTLED_MM:
+            break
+    if not settled and markers < LEAST_MARKERS:
+        shift = None
+    return Settled(camera, left_open, settled, shift)
+
+
+def _apart_mm(before: CubeCamera, after: CubeCamera, point: Floats) -> float:
+    """How far apart two cameras see a ``point`` (3,)."""
+    miss = before.view.project(point[None]) - after.view.project(point[None])
+    return float(np.linalg.norm(miss)) * after.pixel_mm
