@@ -30,15 +30,15 @@ LEAST_SIGMA_MM = 0.01
 LEAST_COSINE = 0.15
 """A surface seen more obliquely than this tells little about its height."""
 
-OF_WIDTH = 0.13
+OF_WIDTH = 0.136
 """Standard deviation of a vertex along its normal as a share of the width of the photos' agreement there, where they
 agree perfectly and all that can be are compared."""
-OF_DISAGREEMENT = 0.55
+OF_DISAGREEMENT = 0.4
 """By how much more of itself it is larger where they do not agree at all."""
 MOST_VIEWS = 9
 MOST_UNLIKE = 16.0
 """A vertex counts as at most this much sharper or less sharp than is usual: beyond, its own figure is chance."""
-OF_JUMP = 0.65
+OF_JUMP = 0.75
 """Share of a jump of the surface within a cube pixel's reach that a sideways error turns into height."""
 STEP_REACH_MM = 0.17
 STEEP_MM = 2 * STEP_REACH_MM * float(np.tan(np.radians(60)))
