@@ -137,12 +137,12 @@ def moved_by(mesh: Mesh, pose: Pose) -> Mesh:
     return Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), mesh.colours)
 
 
-def seen(mesh: Mesh, seed: int = 0, noise: float = 0.01) -> NDArray[np.float32]:
+def seen(mesh: Mesh, seed: int = 0, noise: float = 0.01, view: View = VIEW) -> NDArray[np.float32]:
     """A linear image of the mesh whose brightness is not that of the photos: the negative of its red."""
     caster = RayCaster(mesh)
-    lens = VIEW.intrinsics
+    lens = view.intrinsics
     pixels = np.stack(np.meshgrid(np.arange(lens.width), np.arange(lens.height)), -1).reshape(-1, 2).astype(float)
-    hits = caster.cast(VIEW.cam_from_world.centre, VIEW.world_rays(pixels))
+    hits = caster.cast(view.cam_from_world.centre, view.world_rays(pixels))
     grey = np.where(hits.hit, 1 - caster.colours(hits)[:, 0] / 255.0, np.nan)
     grey += noise * np.random.default_rng(seed).standard_normal(grey.shape)
     return grey.reshape(lens.height, lens.width).astype(np.float32)
@@ -150,6 +150,16 @@ def seen(mesh: Mesh, seed: int = 0, noise: float = 0.01) -> NDArray[np.float32]:
 
 def turned(degrees: float, shift: Floats) -> Pose:
     return Pose(rotation_from_vector(np.array([0, 0, np.radians(degrees)])), shift)
+
+
+@pytest.mark.parametrize("width", [497, 500, 503])
+def test_an_image_brought_to_working_size_keeps_its_place(width: int) -> None:
+    # No whole number of working pixels fits these widths; half of one is 0.1 mm at the far side.
+    fine = View(Intrinsics.centred(width, 401, 2470.0), VIEW.cam_from_world)
+    mesh = textured()
+    shift = specimen_shift(seen(mesh, view=fine), fine, RayCaster(mesh), CORNERS, markers_in_cube=4)
+    assert shift is not None
+    assert 1e-5 < np.hypot(*shift.shift_mm) < 0.02
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
