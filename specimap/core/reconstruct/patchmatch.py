@@ -80,7 +80,8 @@ def check_device(settings: DepthSettings) -> None:
     if missing is not None:
         raise BackendUnavailableError(
             f"{DENSE_DEVICE} asks for dense stereo on a GPU. {missing}",
-            advice="docs/backends.md says what it takes; auto takes a GPU only where there is one.",
+            advice="Install pycolmap-cuda12 in place of pycolmap on a machine with an NVIDIA GPU (docs/backends.md), "
+            "or choose the CPU; auto takes a GPU only where there is one.",
             missing=missing,
         )
 
