@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import sqlalchemy as sa
+from sqlalchemy.orm import Session
 
 from specimap.core.errors import NotFoundError
 from specimap.core.pipeline.artefacts import Store
 from specimap.infra.database import Database
 from specimap.infra.ids import new_id
 from specimap.infra.jobs import held
-from specimap.infra.models import Artefact
+from specimap.infra.models import Acquisition, Artefact
 from specimap.infra.storage import Storage
 
 SAVED = ("reconstruct", "adjust", "render")
@@ -72,6 +73,7 @@ class Artefacts:
         self.storage.put_file(storage_key, copy)
         try:
             with self.database.session() as session:
+                self._alone(session)
                 job = held(session, job_id, executor)
                 of_stage = sa.and_(Artefact.acquisition_id == self.acquisition_id, Artefact.stage == stage)
                 old = list(session.scalars(sa.select(Artefact.storage_key).where(of_stage)))
@@ -95,6 +97,16 @@ class Artefacts:
             raise
         for key_before in old:
             self.storage.delete(key_before)
+
+    def _alone(self, session: Session) -> None:
+        """Let no other job of this acquisition replace an artefact until the transaction ends.
+
+        Of two that do so at once, neither would see the row of the other. The acquisition is locked before the job, in
+        the order in which removing an acquisition locks them; SQLite has one writer at a time anyway.
+        """
+        session.execute(
+            sa.select(Acquisition.id).where(Acquisition.id == self.acquisition_id).with_for_update(key_share=True)
+        )
 
     def _row(self, stage: str, key: str) -> Artefact | None:
         with self.database.session() as session:
