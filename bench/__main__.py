@@ -18,6 +18,7 @@ from bench.machine import describe, in_words
 from bench.photos import bench_photos
 from bench.record import keep
 from bench.sample import bench_sample
+from bench.sigma import bench_sigma
 from bench.steps import bench_steps
 
 Part = Callable[[Console, Path, int], dict[str, object]]
@@ -29,6 +30,7 @@ PARTS: dict[str, Part] = {
     "photos": bench_photos,
     "accuracy": bench_accuracy,
     "budget": bench_budget,
+    "sigma": bench_sigma,
     "features": bench_features,
 }
 

@@ -13,25 +13,18 @@ from rich.table import Table
 from scipy.ndimage import map_coordinates
 
 from bench.sample import SAMPLE
-from specimap.core.accuracy import CornersInCube
+from bench.scene import Scene, scaled_maps
 from specimap.core.acquisition import photo_paths, read_photos
-from specimap.core.cube import open_cube
 from specimap.core.evidence.truth import SPECIMEN
-from specimap.core.geometry import Floats, Intrinsics, Pose, View, fit_similarity
+from specimap.core.geometry import Floats, Pose, View, fit_similarity
 from specimap.core.phantom import load_truth
-from specimap.core.phantom.truth import Truth
-from specimap.core.pipeline.artefacts import Stage1, Stage2
 from specimap.core.pipeline.clock import Clock
-from specimap.core.pipeline.finish import corners_in_cube
 from specimap.core.pipeline.outputs import Outputs
 from specimap.core.pipeline.settings import PipelineSettings
 from specimap.core.pipeline.stages import adjust_stage, mesh_of, reconstruct_stage
 from specimap.core.raycast import RayCaster
 from specimap.core.reconstruct.dense import dense_depth
-from specimap.core.reconstruct.depth import DepthMap, volume_over
-from specimap.core.register.cube_markers import find_markers
-from specimap.core.register.register import place_by_camera
-from specimap.core.register.settle import settle_camera
+from specimap.core.reconstruct.depth import volume_over
 from specimap.core.surface import Mesh
 
 
@@ -73,11 +66,11 @@ def budget(folder: Path, scratch: Path) -> Iterator[Part]:
     truth, paths = load_truth(folder), photo_paths(folder / "rgb")
     stage1 = reconstruct_stage(paths, settings, store, "1", clock, workers)
     stage2 = adjust_stage(stage1, settings, store, "2", clock, workers)
-    scene = _Scene(folder, truth, stage1, stage2, settings)
+    scene = Scene(folder, truth, stage1, stage2, settings)
     mesh, camera = stage2.mesh, scene.camera
-    yield scene.judged("nothing", mesh, camera)
-    yield scene.judged("the cube's camera", mesh, scene.true_camera)
-    yield scene.scaled("the scale", mesh, camera)
+    yield _judged(scene, "nothing", mesh, camera)
+    yield _judged(scene, "the cube's camera", mesh, scene.true_camera)
+    yield _scaled(scene, "the scale", mesh, camera)
     images = [p.image for p in read_photos(paths, settings.acquisition, workers=workers)[0]]
     lens, poses, corners = scene.true_photos()
     maps = dense_depth(
@@ -85,81 +78,47 @@ def budget(folder: Path, scratch: Path) -> Iterator[Part]:
         settings.reconstruct.depth, workers=workers,
     )  # fmt: skip
     redone = mesh_of(tuple(maps), list(stage1.greys), lens, poses, corners, settings, workers=workers).mesh
-    yield scene.judged("the photos' cameras and corners", redone, camera)
-    yield scene.judged("all cameras", redone, scene.true_camera)
+    yield _judged(scene, "the photos' cameras and corners", redone, camera)
+    yield _judged(scene, "all cameras", redone, scene.true_camera)
     rough = replace(settings, refine=replace(settings.refine, passes=()))
-    unrefined = _scaled_maps(stage1, stage2)
+    unrefined = scaled_maps(stage1, stage2)
     adjusted = stage2.adjusted
     fused = mesh_of(
         unrefined, list(stage1.greys), adjusted.lens, adjusted.poses, adjusted.corners, rough, workers=workers
     ).mesh
-    yield scene.judged("nothing, and the mesh not refined", fused, camera)
-    yield scene.on_true_surface("the surface")
+    yield _judged(scene, "nothing, and the mesh not refined", fused, camera)
+    yield _on_true_surface(scene, "the surface")
 
 
-def _scaled_maps(stage1: Stage1, stage2: Stage2) -> tuple[DepthMap, ...]:
-    factor = np.float32(stage2.adjusted.scale)
-    return tuple(replace(m, depth=m.depth * factor) for m in stage1.reconstruction.maps)
+def _judged(scene: Scene, name: str, mesh: Mesh, view: View) -> Part:
+    """The error where ``view`` casts the cube's pixels onto ``mesh``."""
+    _, _, errors = scene.placed(RayCaster(mesh), view)
+    return _part(name, errors)
 
 
-class _Scene:
-    """A finished run beside its truth; ``ours`` takes the truth's frame into the run's."""
+def _scaled(scene: Scene, name: str, mesh: Mesh, view: View) -> Part:
+    """The error with lengths as long as the true ones."""
+    size, _, _ = fit_similarity(
+        scene.adjusted.corners.reshape(-1, 3), scene.true_corners.reshape(-1, 3), with_scale=True
+    )
+    pose = view.cam_from_world
+    return _judged(
+        scene,
+        name,
+        replace(mesh, vertices=(mesh.vertices * size).astype(np.float32)),
+        View(view.intrinsics, Pose(pose.R, pose.t * size)),
+    )
 
-    def __init__(
-        self, folder: Path, truth: Truth, stage1: Stage1, stage2: Stage2, settings: PipelineSettings
-    ) -> None:
-        self._truth, self._stage1, self._adjusted = truth, stage1, stage2.adjusted
-        cube = open_cube(next((folder / "hsi").glob("*.hdr")))
-        found = find_markers(cube, settings.reconstruct.dictionary, stage2.adjusted.marker_ids)
-        seen: CornersInCube = corners_in_cube(found, stage2.adjusted, cube.cols)
-        caster = RayCaster(stage2.mesh)
-        settled = settle_camera(seen, found, cube.rows, cube.cols, caster, stage2.adjusted.corners)
-        self.camera = settled.camera.view
-        ids = list(truth.marker_ids)
-        self._true_corners = truth.marker_corners[[ids.index(i) for i in stage2.adjusted.marker_ids]]
-        _, R, t = fit_similarity(self._true_corners.reshape(-1, 3), stage2.adjusted.corners.reshape(-1, 3))
-        self.ours = Pose(R, t)
-        self.true_camera = View(truth.hsi_view.intrinsics, truth.hsi_view.cam_from_world @ self.ours.inverse())
 
-    def true_photos(self) -> tuple[Intrinsics, tuple[Pose, ...], Floats]:
-        """The photos' true lens, poses and corners in the run's frame."""
-        names = [Path(n).name for n in self._truth.photo_names]
-        used = [names.index(self._stage1.names[p]) for p in self._stage1.reconstruction.photos]
-        views = [self._truth.views[i] for i in used]
-        poses = tuple(v.cam_from_world @ self.ours.inverse() for v in views)
-        corners = self.ours.apply(self._true_corners.reshape(-1, 3)).reshape(-1, 4, 3)
-        return views[0].intrinsics, poses, corners
-
-    def judged(self, name: str, mesh: Mesh, view: View) -> Part:
-        """The error where ``view`` casts the cube's pixels onto ``mesh``."""
-        placed = place_by_camera(view, RayCaster(mesh), False)
-        rows, cols = placed.pixels[:, 0], placed.pixels[:, 1]
-        on_it = self._truth.hsi_class[rows, cols] == SPECIMEN
-        true = self.ours.apply(self._truth.hsi_xyz[rows[on_it], cols[on_it]].astype(float))
-        return _part(name, np.linalg.norm(placed.xyz[on_it] - true, axis=1))
-
-    def scaled(self, name: str, mesh: Mesh, view: View) -> Part:
-        """The error with lengths as long as the true ones."""
-        size, _, _ = fit_similarity(
-            self._adjusted.corners.reshape(-1, 3), self._true_corners.reshape(-1, 3), with_scale=True
-        )
-        pose = view.cam_from_world
-        return self.judged(
-            name,
-            replace(mesh, vertices=(mesh.vertices * size).astype(np.float32)),
-            View(view.intrinsics, Pose(pose.R, pose.t * size)),
-        )
-
-    def on_true_surface(self, name: str) -> Part:
-        """The error of registration alone: pixels land on the true surface where the solved camera takes them."""
-        rows, cols = np.nonzero(self._truth.hsi_class == SPECIMEN)
-        true = self._truth.hsi_xyz[rows, cols].astype(float)
-        miss = self.camera.project(self.ours.apply(true)) - np.stack([cols, rows], -1)
-        at = np.stack([rows - miss[:, 1], cols - miss[:, 0]])
-        there = np.stack(
-            [map_coordinates(self._truth.hsi_xyz[..., k].astype(float), at, order=1) for k in range(3)], -1
-        )
-        return _part(name, np.linalg.norm(there - true, axis=1))
+def _on_true_surface(scene: Scene, name: str) -> Part:
+    """The error of registration alone: pixels land on the true surface where the solved camera takes them."""
+    truth = scene.truth
+    rows, cols = np.nonzero(truth.hsi_class == SPECIMEN)
+    true = truth.hsi_xyz[rows, cols].astype(float)
+    miss = scene.camera.project(scene.ours.apply(true)) - np.stack([cols, rows], -1)
+    at = np.stack([rows - miss[:, 1], cols - miss[:, 0]])
+    there = np.stack([map_coordinates(truth.hsi_xyz[..., k].astype(float), at, order=1) for k in range(3)], -1)
+    return _part(name, np.linalg.norm(there - true, axis=1))
 
 
 def _part(name: str, errors: Floats) -> Part:

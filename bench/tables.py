@@ -16,6 +16,7 @@ from bench.photos import sheet_photos
 from bench.record import RESULTS
 from bench.service.parts import PARTS, in_markdown
 from bench.service.sheet import Sheet
+from bench.sigma import sheet_sigma
 from bench.steps import sheet_steps
 from specimap.core.evidence.marks import put
 
@@ -109,6 +110,7 @@ def main() -> None:
     if REAL in figures:
         put(ROOT / "docs" / "accuracy.md", "apple", real_line(figures[REAL]))
     put(ROOT / "docs" / "accuracy.md", "budget", budget_table(newest("budget")))
+    put(ROOT / "docs" / "accuracy.md", "sigma", sheet_sigma(newest("sigma")).markdown())
     for part in OF_RUNS:
         put(ROOT / "docs" / "performance.md", part, run_tables(part, newest_record(part)))
     for part in PARTS:

@@ -13,7 +13,7 @@ from specimap.core.refine import Refined, RefineSettings, refine_mesh
 from specimap.core.uncertainty import (
     AGREEMENT_MM,
     LEAST_SIGMA_MM,
-    OF_JUMP,
+    SHARES,
     STEEP_MM,
     STEP_REACH_MM,
     UNSEEN_SIGMA_MM,
@@ -111,7 +111,7 @@ def test_a_flank_is_no_jump() -> None:
     step = np.array([0.0, STEEP_MM, STEEP_MM + 0.4], np.float32)
     flat, flank, jump = point_sigma(surface, step, 0.0, 0.0).tolist()
     assert flank == pytest.approx(flat)
-    assert jump == pytest.approx(np.hypot(0.05, 0.4 * OF_JUMP), rel=1e-4)
+    assert jump == pytest.approx(np.hypot(0.05, 0.4 * SHARES.of_jump), rel=1e-4)
 
 
 @pytest.mark.parametrize("part", range(4))

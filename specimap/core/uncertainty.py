@@ -10,6 +10,7 @@ within one and 95 % within two; docs/accuracy.md has what came of it on others.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -30,26 +31,42 @@ LEAST_SIGMA_MM = 0.01
 LEAST_COSINE = 0.15
 """A surface seen more obliquely than this tells little about its height."""
 
-OF_WIDTH = 0.136
-"""Standard deviation of a vertex along its normal as a share of the width of the photos' agreement there, where they
-agree perfectly and all that can be are compared."""
-OF_DISAGREEMENT = 0.4
-"""By how much more of itself it is larger where they do not agree at all."""
 MOST_VIEWS = 9
 MOST_UNLIKE = 16.0
 """A vertex counts as at most this much sharper or less sharp than is usual: beyond, its own figure is chance."""
-OF_JUMP = 0.75
-"""Share of a jump of the surface within a cube pixel's reach that a sideways error turns into height."""
 STEP_REACH_MM = 0.17
 STEEP_MM = 2 * STEP_REACH_MM * float(np.tan(np.radians(60)))
 """A flank of 60 degrees rises by so much within the reach; what is more is a jump."""
+
+
+@dataclass(frozen=True)
+class Shares:
+    """What a standard deviation is made of, as ``python -m bench --only sigma`` sets it.
+
+    ``of_width``: standard deviation of a vertex along its normal as a share of the width of the photos' agreement
+    there, where they agree perfectly and all that can be are compared. ``of_disagreement``: by how much more of itself
+    it is larger where they do not agree at all. ``of_jump``: share of a jump of the surface within a cube pixel's reach
+    that a sideways error turns into height.
+    """
+
+    of_width: float = 0.136
+    of_disagreement: float = 0.4
+    of_jump: float = 0.75
+
+
+SHARES = Shares()
 
 
 def mesh_sigma(
     refined: Refined, maps: tuple[DepthMap, ...], poses: tuple[Pose, ...], *, workers: int = 1
 ) -> NDArray[np.float32]:
     """Standard deviation (V,) mm of a refined mesh's vertices."""
-    scatter = vertex_scatter(refined.mesh, maps, poses, workers=workers)
+    return refined_sigma(refined, vertex_scatter(refined.mesh, maps, poses, workers=workers))
+
+
+def refined_sigma(refined: Refined, scatter: NDArray[np.float32], shares: Shares = SHARES) -> NDArray[np.float32]:
+    """Standard deviation (V,) mm of a refined mesh's vertices, given that of its depth maps (:func:`vertex_scatter`),
+    which holds where the photos were not compared."""
     done = (refined.views > 0) & np.isfinite(refined.sharpness)
     if not (refined.sharpness[done] > 0).any():
         return scatter
@@ -59,8 +76,8 @@ def mesh_sigma(
     sharpness = np.clip(refined.sharpness[measured], usual / MOST_UNLIKE, usual * MOST_UNLIKE)
     fewer = MOST_VIEWS / np.maximum(refined.views[measured], 1)
     sigma = scatter.copy()
-    apart = 1 + OF_DISAGREEMENT * (1 - np.clip(refined.agreement[measured], 0, 1))
-    sigma[measured] = OF_WIDTH * apart * np.sqrt(fewer / sharpness)
+    apart = 1 + shares.of_disagreement * (1 - np.clip(refined.agreement[measured], 0, 1))
+    sigma[measured] = shares.of_width * apart * np.sqrt(fewer / sharpness)
     return np.clip(sigma, LEAST_SIGMA_MM, UNSEEN_SIGMA_MM).astype(np.float32)
 
 
@@ -109,9 +126,7 @@ def _distance_along_normals(mesh: Mesh, depth_map: DepthMap, pose: Pose) -> NDAr
     return out
 
 
-def step_height(
-    pixels: NDArray[np.uint16], z: NDArray[np.float32], pixel_mm: float
-) -> NDArray[np.float32]:
+def step_height(pixels: NDArray[np.uint16], z: NDArray[np.float32], pixel_mm: float) -> NDArray[np.float32]:
     """Range (S,) of the heights ``z`` (S,) mm around each of the cube's ``pixels`` (S, 2) row, column.
 
     Within ``STEP_REACH_MM`` of it, taken from whole pixels in proportion: large on flanks and across edges behind
@@ -136,9 +151,10 @@ def point_sigma(
     step_mm: NDArray[np.float32],
     corner_sigma_mm: float,
     registration_mm: float,
+    shares: Shares = SHARES,
 ) -> NDArray[np.float32]:
     """Standard deviation (S,) mm of points: the surface's own, what jumps of the surface (:func:`step_height` beyond a
     flank's) make of a sideways error, the layout's, and the registration's."""
     shared = np.float32(np.hypot(corner_sigma_mm, registration_mm))
-    jump = np.float32(OF_JUMP) * np.maximum(step_mm - np.float32(STEEP_MM), 0)
+    jump = np.float32(shares.of_jump) * np.maximum(step_mm - np.float32(STEEP_MM), 0)
     return np.asarray(np.hypot(np.hypot(surface_sigma, jump), shared), np.float32)

@@ -1,0 +1,66 @@
+"""A finished reconstruction beside its truth, for what the parts of the way add to the error."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specimap.core.accuracy import CornersInCube
+from specimap.core.cube import open_cube
+from specimap.core.evidence.truth import SPECIMEN
+from specimap.core.geometry import Floats, Intrinsics, Pose, View, fit_similarity
+from specimap.core.phantom.truth import Truth
+from specimap.core.pipeline.artefacts import Stage1, Stage2
+from specimap.core.pipeline.finish import corners_in_cube
+from specimap.core.pipeline.settings import PipelineSettings
+from specimap.core.raycast import RayCaster
+from specimap.core.reconstruct.depth import DepthMap
+from specimap.core.register.cube_markers import find_markers
+from specimap.core.register.register import Placement, place_by_camera
+from specimap.core.register.settle import settle_camera
+
+
+class Scene:
+    """``settled``: the cube's camera as the run solves it; ``true_camera``: as it was, in the run's frame; ``ours``
+    takes the truth's frame into the run's."""
+
+    def __init__(self, folder: Path, truth: Truth, stage1: Stage1, stage2: Stage2, settings: PipelineSettings) -> None:
+        self.truth, self.adjusted = truth, stage2.adjusted
+        self._stage1 = stage1
+        cube = open_cube(next((folder / "hsi").glob("*.hdr")))
+        found = find_markers(cube, settings.reconstruct.dictionary, stage2.adjusted.marker_ids)
+        seen: CornersInCube = corners_in_cube(found, stage2.adjusted, cube.cols)
+        self.caster = RayCaster(stage2.mesh)
+        self.settled = settle_camera(seen, found, cube.rows, cube.cols, self.caster, stage2.adjusted.corners)
+        self.camera = self.settled.camera.view
+        ids = list(truth.marker_ids)
+        self.true_corners = truth.marker_corners[[ids.index(i) for i in stage2.adjusted.marker_ids]]
+        _, R, t = fit_similarity(self.true_corners.reshape(-1, 3), stage2.adjusted.corners.reshape(-1, 3))
+        self.ours = Pose(R, t)
+        self.true_camera = View(truth.hsi_view.intrinsics, truth.hsi_view.cam_from_world @ self.ours.inverse())
+
+    def true_photos(self) -> tuple[Intrinsics, tuple[Pose, ...], Floats]:
+        """The photos' true lens, poses and corners in the run's frame."""
+        names = [Path(n).name for n in self.truth.photo_names]
+        used = [names.index(self._stage1.names[p]) for p in self._stage1.reconstruction.photos]
+        views = [self.truth.views[i] for i in used]
+        poses = tuple(v.cam_from_world @ self.ours.inverse() for v in views)
+        corners = self.ours.apply(self.true_corners.reshape(-1, 3)).reshape(-1, 4, 3)
+        return views[0].intrinsics, poses, corners
+
+    def placed(self, caster: RayCaster, view: View) -> tuple[Placement, NDArray[np.intp], Floats]:
+        """Where ``view`` casts the cube's pixels; which places (n,) are the specimen's, and their errors (n,) mm."""
+        placed = place_by_camera(view, caster, False)
+        rows, cols = placed.pixels[:, 0], placed.pixels[:, 1]
+        at = np.flatnonzero(self.truth.hsi_class[rows, cols] == SPECIMEN)
+        true = self.ours.apply(self.truth.hsi_xyz[rows[at], cols[at]].astype(float))
+        return placed, at, np.linalg.norm(placed.xyz[at] - true, axis=1)
+
+
+def scaled_maps(stage1: Stage1, stage2: Stage2) -> tuple[DepthMap, ...]:
+    """The depth maps of stage 1 in mm."""
+    factor = np.float32(stage2.adjusted.scale)
+    return tuple(replace(m, depth=m.depth * factor) for m in stage1.reconstruction.maps)
