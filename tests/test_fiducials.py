@@ -132,6 +132,25 @@ def test_squares_of_all_sizes_are_measured_together_as_alone() -> None:
         assert 0.005 < sigma[0] < 0.1
 
 
+def covered(low: float, high: float, count: int) -> NDArray[np.float32]:
+    """Share of each of ``count`` pixels that lies between two places."""
+    pixels = np.arange(count)
+    share = np.minimum(high, pixels + 0.5) - np.maximum(low, pixels - 0.5)
+    return np.asarray(np.clip(share, 0, 1), np.float32)
+
+
+def test_sharp_edges_along_the_pixels_are_found_between_them() -> None:
+    """All profiles of such an edge are sampled alike, so that nothing averages out."""
+    errors = []
+    for phase in np.linspace(0, 1, 11):
+        low, high = 20 + np.array([phase, 0.7 * phase]), 61.3 + np.array([0.4 * phase, phase])
+        black = covered(low[1], high[1], 90)[:, None] * covered(low[0], high[0], 90)
+        truth = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+        found, _ = refine_corners(0.75 - 0.7 * black, truth[None] + 0.3)
+        errors.append(found[0] - truth)
+    assert 0.0005 < np.abs(errors).max() < 0.05
+
+
 def test_a_square_without_edges_keeps_its_corners() -> None:
     places = {0: square(80.3, 70.7, 41.2, 12)}
     light = linear_from_srgb(picture(places))

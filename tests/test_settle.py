@@ -295,7 +295,8 @@ def test_a_run_on_blurred_photos_is_settled(blurred: tuple[Path, Report]) -> Non
     assert not codes(report) & {"specimen_moved", "cube_camera_loose"}
     before, after, settled = resolved(folder)
     assert settled.by_specimen
-    assert settled.open_mm > LOOSE_MM
     assert settled.shift is not None
+    # The specimen has more to say than the corners.
+    assert settled.open_mm > settled.shift.sigma_mm
     assert 0.003 < after < min(before, 3 * settled.shift.sigma_mm)
     assert 0.3 * after < settled.sideways_mm < LOOSE_MM

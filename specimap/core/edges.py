@@ -25,6 +25,13 @@ REACH_SHARES = 0.11, 0.08
 """How far profiles reach, in widths of the square, in each pass: the second starts close and sees less around."""
 BATCH = 16
 """Edges whose profiles are sampled together: of like reach, and few enough to stay in the processor's cache."""
+EDGE_PX = 0.8
+"""Sharper edges are blurred to this, one standard deviation: between pixels, interpolation puts an edge that is sharper
+up to a seventh of a pixel off, by where it lies between them, and all profiles alike where it runs along them."""
+SOFTER_PX = 0.2
+"""Blurs are multiples of this, so that the edges of a photo share a few blurred pictures."""
+MOST_BLUR = 1 / 40
+"""Largest blur over the length of the edge: more would bring the marker's pattern into what is measured at its rim."""
 UNMEASURED_PX = 0.5
 """Standard deviation of an edge, and of a corner, that gave no line."""
 
@@ -36,6 +43,7 @@ def refine_corners(linear: Singles, squares: Floats) -> tuple[Floats, Floats]:
     keeps the line through the corners it came with and a sigma of half a pixel.
     """
     corners, sigma = squares.copy(), np.full(len(squares), UNMEASURED_PX)
+    widths = np.full((len(squares), 4), np.inf)
     rows = np.arange(len(squares))
     for share in REACH_SHARES:
         if not len(rows):
@@ -44,8 +52,8 @@ def refine_corners(linear: Singles, squares: Floats) -> tuple[Floats, Floats]:
         after = np.roll(before, -1, axis=1)
         centres = np.repeat(before.mean(1, keepdims=True), 4, axis=1)
         a, b, c = (np.asarray(x.reshape(-1, 2)) for x in (before, after, centres))
-        lines, errors = _fit_edges(linear, a, b, c, share)
-        lines, errors = lines.reshape(-1, 4, 3), errors.reshape(-1, 4)
+        lines, errors, seen = _fit_edges(linear, a, b, c, share, widths[rows].ravel())
+        lines, errors, widths[rows] = lines.reshape(-1, 4, 3), errors.reshape(-1, 4), seen.reshape(-1, 4)
         crossed = np.cross(np.roll(lines, 1, axis=1), lines)
         with np.errstate(divide="ignore", invalid="ignore"):
             moved = crossed[..., :2] / crossed[..., 2:]
@@ -58,9 +66,12 @@ def refine_corners(linear: Singles, squares: Floats) -> tuple[Floats, Floats]:
     return corners, sigma
 
 
-def _fit_edges(linear: Singles, a: Floats, b: Floats, centres: Floats, share: float) -> tuple[Floats, Floats]:
-    """Lines (E, 3) with ``line @ (x, y, 1) = 0`` along the edges from ``a`` to ``b`` (both (E, 2)), and their standard
-    deviations (E,) in pixels. ``centres`` (E, 2): of the squares they belong to."""
+def _fit_edges(
+    linear: Singles, a: Floats, b: Floats, centres: Floats, share: float, widths: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Lines (E, 3) with ``line @ (x, y, 1) = 0`` along the edges from ``a`` to ``b`` (both (E, 2)), their standard
+    deviations (E,), and the edges' own widths (E,), infinite where no profile is clear; all in pixels. ``centres``
+    (E, 2): of the squares they belong to; ``widths`` (E,): how wide the edges have proved so far."""
     length = np.linalg.norm(b - a, axis=1)
     along = (b - a) / length[:, None]
     normal = np.stack([along[:, 1], -along[:, 0]], -1)
@@ -71,12 +82,18 @@ def _fit_edges(linear: Singles, a: Floats, b: Floats, centres: Floats, share: fl
     # The dark border is one module wide (a sixth of the edge, or less in larger dictionaries), seen at a slant.
     reach = np.clip(share * 2 * np.abs(depth), 1.6, 8.0)
     s = np.linspace(EDGE_MARGIN, 1 - EDGE_MARGIN, PROFILES_PER_EDGE) * length[:, None]
-    v, clear = np.empty(s.shape), np.empty(s.shape, bool)
-    for some in np.array_split(np.argsort(reach), -(-len(a) // BATCH)):
-        v[some], clear[some] = _positions(linear, *(x[some] for x in (a, along, normal, s, reach)))
+    v, clear, width = np.empty(s.shape), np.empty(s.shape, bool), np.empty(s.shape)
+    lacking = np.minimum(np.sqrt(np.maximum(EDGE_PX**2 - widths**2, 0)), MOST_BLUR * length)
+    blur = SOFTER_PX * np.round(lacking / SOFTER_PX)
+    for sd in np.unique(blur):
+        light = cv2.GaussianBlur(linear, (0, 0), float(sd)) if sd else linear
+        alike = np.flatnonzero(blur == sd)
+        for some in np.array_split(alike[np.argsort(reach[alike])], -(-len(alike) // BATCH)):
+            v[some], clear[some], width[some] = _positions(light, *(x[some] for x in (a, along, normal, s, reach)))
+    wide = _median(width, clear)
     fits = np.flatnonzero(clear.sum(1) >= PROFILES_PER_EDGE // 2)
     if not len(fits):
-        return lines, errors
+        return lines, errors, wide
     slope, offset, scatter, kept = _fit_robustly(s[fits], v[fits], clear[fits])
     across = normal[fits] - along[fits] * slope[:, None]
     across /= np.linalg.norm(across, axis=1, keepdims=True)
@@ -86,13 +103,14 @@ def _fit_edges(linear: Singles, a: Floats, b: Floats, centres: Floats, share: fl
     error = np.maximum(0.01, 2 * scatter / np.sqrt(np.minimum(length[fits], kept)))
     good = kept >= PROFILES_PER_EDGE // 3
     lines[fits[good]], errors[fits[good]] = found[good], error[good]
-    return lines, errors
+    return lines, errors, wide
 
 
 def _positions(
     linear: Singles, a: Floats, along: Floats, normal: Floats, s: Floats, reach: Floats
-) -> tuple[Floats, Flags]:
-    """Where the edge crosses the profiles at ``s`` (E, K) along it, in pixels outward (E, K), and which are clear."""
+) -> tuple[Floats, Flags, Floats]:
+    """Where the edge crosses the profiles at ``s`` (E, K) along it, in pixels outward (E, K); which are clear; how wide
+    the edge is there (E, K), one standard deviation."""
     # Profiles reach as far as their own edge asks; what pads them to the longest has no say.
     count = np.ceil((2 * reach + 1e-6) / SAMPLE_PX).astype(int)
     steps = np.arange(count.max())
@@ -123,7 +141,8 @@ def _positions(
         windowed = weight * np.clip(1 - np.abs(d[:, None] - position[..., None]) / half, 0, None)
         total, moment = windowed.sum(2), (windowed @ d[..., None])[..., 0]
         position = np.where(total > 0, moment / np.maximum(total, 1e-12), position)
-    return position, clear
+    variance = (windowed * (d[:, None] - position[..., None]) ** 2).sum(2) / np.maximum(total, 1e-12)
+    return position, clear, np.sqrt(variance)
 
 
 def _fit_robustly(u: Floats, v: Floats, clear: Flags) -> tuple[Floats, Floats, Floats, NDArray[np.int64]]:

@@ -19,10 +19,12 @@ from specimap.core.phantom.scene import BENCH, CARDS, KEY_LIGHTS, SPECIMEN, TRAY
 
 CLASS_NONE, CLASS_SPECIMEN, CLASS_CARD, CLASS_TRAY, CLASS_BENCH = range(5)
 _CLASS_OF_GEOMETRY = np.array([CLASS_SPECIMEN, CLASS_CARD, CLASS_TRAY, CLASS_BENCH, CLASS_NONE], np.uint8)
-# Rays per pixel and step of a Fibonacci lattice. A square grid of as many rays would round an edge that runs
-# along the pixels to the grid's few rows; here every ray has a row and a column of its own.
+# Rays per pixel and step of a Fibonacci lattice, where every ray has a row and a column of its own. Any lattice has
+# directions in which its rays stand in few rows, to which an edge that runs along them is rounded (a square grid along
+# the pixels, this one at 31 degrees): so each pixel's is shifted by chance, and an edge's pixels err apart.
 _SPECIMEN_RAYS, _BORDER_RAYS = 5, 34
 _LATTICE_STEP = {_SPECIMEN_RAYS: 3, _BORDER_RAYS: 21}
+_SHIFT_SEED = 20
 _SHININESS = 60.0
 _DETAIL_SD = 0.16
 _BENCH_LIGHT = 0.75
@@ -67,10 +69,11 @@ def render_view(scene: Scene, view: View, paint: Paint, *, gloss: float = 0.0) -
     colour, points, surface, geometry = _sample(scene, view, paint, pixels, gloss)
 
     rays = _rays_per_pixel(surface.reshape(h, w), (geometry == SPECIMEN).reshape(h, w)).ravel()
+    shift = np.random.default_rng(_SHIFT_SEED).random((h * w, 1, 2))
     for n, step in _LATTICE_STEP.items():
         chosen = np.flatnonzero(rays == n)
         k = np.arange(n)
-        spread = (np.stack([k, k * step % n], 1) + 0.5) / n - 0.5
+        spread = (np.stack([k, k * step % n], 1) / n + shift[chosen]) % 1 - 0.5
         fine = _sample(scene, view, paint, (pixels[chosen, None] + spread).reshape(-1, 2), gloss)[0]
         colour[chosen] = fine.reshape(len(chosen), n, -1).mean(1)
     points[geometry < 0] = np.nan
