@@ -23,8 +23,7 @@ from specimap.core.pipeline.outputs import Outputs
 from specimap.core.pipeline.settings import PipelineSettings
 from specimap.core.pipeline.stages import adjust_stage, mesh_of, reconstruct_stage
 from specimap.core.raycast import RayCaster
-from specimap.core.refine import Refined
-from specimap.core.uncertainty import SHARES, Shares, point_sigma, refined_sigma, step_height, vertex_scatter
+from specimap.core.uncertainty import SHARES, Evidence, Shares, bend_mm, point_sigma, step_height, vertex_scatter
 
 CUBE: dict[str, Any] = {"bands": 8, "wavelength_nm": (400.0, 1000.0)}
 SETTING = {
@@ -46,27 +45,27 @@ JUDGING = {
     "breathing 1 %, distortion (55)": PhantomSettings(seed=55, focal_spread=0.01, k1=-0.1, k2=0.03, **CUBE),
     "blur 1.2 px, gloss 0.3 (56)": PhantomSettings(seed=56, blur_px=1.2, gloss=0.3, **CUBE),
 }
-"""What they are judged on, besides the path-traced phantoms where they are at hand."""
-PATH_TRACED = {"phantom A": "phantom_a", "phantom hard": "phantom_hard"}
+"""What they are judged on. A path-traced phantom joins each, where they are at hand."""
+TRACED_SETTING, TRACED_JUDGING = {"phantom A": "phantom_a"}, {"phantom hard": "phantom_hard"}
 
 ONE, TWO = 0.68, 0.95
 ALLOWED_ONE, ALLOWED_TWO = 0.06, 0.04
 ROLES = ("set on it", "judged on it")
 GROUPS = 5
-"""A specimen's points are judged in this many groups by what is stated of them: large where it is large, or it says
-nothing."""
+"""A specimen's points are judged in so many groups by what is stated of them, by how much the surface bends and by how
+much it rises there: the shares are to hold in each, or sigma would not tell one place from another."""
 
 
 @dataclass(frozen=True, eq=False)
 class Specimen:
-    """A run whose ``sigma_mm`` can be stated anew: its mesh with the photos' agreement, and its points' ``errors``
-    (n,) mm at the places ``at`` (n,)."""
+    """A run whose ``sigma_mm`` can be stated anew: what is known of its mesh, where its points lie on that, and their
+    ``errors`` (n,) mm."""
 
-    refined: Refined
-    scatter: NDArray[np.float32]
+    evidence: Evidence
     caster: RayCaster
     triangle: NDArray[np.int32]
     barycentric: NDArray[np.float32]
+    bend_mm: NDArray[np.float32]
     step_mm: NDArray[np.float32]
     corner_mm: float
     registration_mm: float
@@ -74,8 +73,7 @@ class Specimen:
 
     def sigma(self, shares: Shares) -> NDArray[np.float32]:
         """Standard deviations (n,) mm."""
-        of_vertex = refined_sigma(self.refined, self.scatter, shares)[:, None]
-        surface = self.caster.interpolate(of_vertex, self.triangle, self.barycentric).ravel()
+        surface = self.caster.interpolate(self.evidence.sigma(shares)[:, None], self.triangle, self.barycentric).ravel()
         return point_sigma(surface, self.step_mm, self.corner_mm, self.registration_mm, shares)
 
     def within(self, shares: Shares) -> tuple[float, float]:
@@ -87,7 +85,11 @@ class Specimen:
         """How far both shares are from a normal distribution's, over what is allowed, squared: mean over the groups."""
         sigma = self.sigma(shares)
         unit = self.errors / sigma
-        groups = np.array_split(np.argsort(sigma, kind="stable"), GROUPS)
+        groups = [
+            group
+            for key in (sigma, self.bend_mm, self.step_mm)
+            for group in np.array_split(np.argsort(key, kind="stable"), GROUPS)
+        ]
         return float(np.mean([_off(float((unit[g] <= 1).mean()), float((unit[g] <= 2).mean())) for g in groups]))
 
 
@@ -99,11 +101,11 @@ def bench_sigma(console: Console, work: Path, repeats: int) -> dict[str, object]
     """Set the shares anew, and judge those in force; runs are seeded, so ``repeats`` does not apply."""
     del repeats
     value = os.environ.get("SPECIMAP_TEST_DATA")
-    setting = dict(_own(SETTING, work))
-    best = fitted(list(setting.values()))
-    judging = dict(_own(JUDGING, work))
+    setting, judging = dict(_own(SETTING, work)), dict(_own(JUDGING, work))
     if value:
-        judging |= {name: specimen(Path(value) / folder, work / folder) for name, folder in PATH_TRACED.items()}
+        for found, traced in ((setting, TRACED_SETTING), (judging, TRACED_JUDGING)):
+            found |= {name: specimen(Path(value) / folder, work / folder) for name, folder in traced.items()}
+    best = fitted(list(setting.values()))
     figures: dict[str, Any] = {"fitted": asdict(best), "in_force": asdict(SHARES)}
     for role, found in zip(ROLES, (setting, judging), strict=True):
         lines = {name: [float(np.median(one.errors)), *one.within(SHARES)] for name, one in found.items()}
@@ -160,11 +162,11 @@ def specimen(folder: Path, scratch: Path) -> Specimen:
     known = np.isfinite(errors)
     at, errors = at[known], errors[known]
     return Specimen(
-        refined,
-        vertex_scatter(refined.mesh, maps, adjusted.poses, workers=workers),
+        Evidence.of(refined, vertex_scatter(refined.mesh, maps, adjusted.poses, workers=workers)),
         scene.caster,
         placed.triangle[at],
         placed.barycentric[at],
+        scene.caster.interpolate(bend_mm(refined.mesh)[:, None], placed.triangle[at], placed.barycentric[at]).ravel(),
         step_height(placed.pixels, placed.xyz[:, 2], scene.settled.camera.pixel_mm)[at],
         float(np.median(adjusted.sigma_corner_mm)),
         scene.settled.sideways_mm,

@@ -18,9 +18,9 @@ from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline
 
 MEDIUM = {"photos": 18, "photo_size": 448, "cube_rows": 256, "cube_cols": 320, "bands": 16, "mesh_divisions": 96}
 PHANTOMS = {
-    "sharp": PhantomSettings(seed=41, **MEDIUM),  # type: ignore[arg-type]
+    "sharp": PhantomSettings(seed=61, **MEDIUM),  # type: ignore[arg-type]
     "blurred": PhantomSettings(
-        seed=42, blur_px=0.7, gloss=0.3, exposure_spread=0.2, card_tilt_deg=1.0, card_lift_mm=0.3, **MEDIUM  # type: ignore[arg-type]
+        seed=62, blur_px=0.7, gloss=0.3, exposure_spread=0.2, card_tilt_deg=1.0, card_lift_mm=0.3, **MEDIUM  # type: ignore[arg-type]
     ),
 }
 ONE, TWO = 0.68, 0.95
@@ -51,19 +51,24 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Shares]:
 
 @pytest.mark.parametrize("name", PHANTOMS)
 def test_stated_deviations_hold_on_a_specimen_that_did_not_set_them(own: dict[str, Shares], name: str) -> None:
-    one, two = own[name]
-    assert abs(one - ONE) <= 0.10, own
-    assert abs(two - TWO) <= 0.06, own
+    assert_near(own[name], 0.10, 0.06)
 
 
 def test_stated_deviations_hold_on_average(own: dict[str, Shares]) -> None:
     one, two = np.mean(list(own.values()), axis=0)
-    assert abs(one - ONE) <= 0.06, own
-    assert abs(two - TWO) <= 0.04, own
+    assert_near((one, two), 0.06, 0.04)
 
 
-@pytest.mark.parametrize("name", ["phantom_a", "phantom_hard"])
-def test_stated_deviations_hold_on_path_traced_tissue(data_dir: Path, tmp_path: Path, name: str) -> None:
-    one, two = shares_of(data_dir / name, tmp_path / "out")
-    assert abs(one - ONE) <= 0.06, (one, two)
-    assert abs(two - TWO) <= 0.04, (one, two)
+def test_stated_deviations_hold_on_path_traced_tissue(data_dir: Path, tmp_path: Path) -> None:
+    assert_near(shares_of(data_dir / "phantom_hard", tmp_path / "out"), 0.06, 0.04)
+
+
+def test_stated_deviations_hold_where_they_were_set(data_dir: Path, tmp_path: Path) -> None:
+    assert_near(shares_of(data_dir / "phantom_a", tmp_path / "out"), 0.10, 0.06)
+
+
+def assert_near(shares: Shares, allowed_one: float, allowed_two: float) -> None:
+    """Within what is allowed of a normal distribution's shares."""
+    one, two = shares
+    assert abs(one - ONE) <= allowed_one, shares
+    assert abs(two - TWO) <= allowed_two, shares

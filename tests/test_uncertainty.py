@@ -10,16 +10,21 @@ from matched_scene import matched
 from numpy.typing import NDArray
 
 from specimap.core.refine import Refined, RefineSettings, refine_mesh
+from specimap.core.surface import Mesh
 from specimap.core.uncertainty import (
     AGREEMENT_MM,
     LEAST_SIGMA_MM,
+    LEAST_SUPPORT,
     SHARES,
     STEEP_MM,
     STEP_REACH_MM,
     UNSEEN_SIGMA_MM,
+    Evidence,
+    bend_mm,
     mesh_sigma,
     point_sigma,
     step_height,
+    support,
     vertex_scatter,
 )
 
@@ -156,12 +161,47 @@ def test_fewer_views_and_less_agreement_make_a_mesh_less_sure(after: Refined) ->
     all_views = replace(after, views=np.where(done, 9, 0).astype(np.uint8))
     assert (mesh_sigma(fewer, scene.maps, scene.poses) >= mesh_sigma(all_views, scene.maps, scene.poses)).all()
     for doubtful in (
-        replace(after, agreement=after.agreement - np.float32(0.2)),
+        replace(after, found=after.found & (np.arange(len(done)) % 2 == 0)),
         replace(after, sharpness=after.sharpness / np.float32(2)),
     ):
         louder = mesh_sigma(doubtful, scene.maps, scene.poses)
         assert (louder >= plain).all()
         assert (louder[done] > plain[done]).mean() > 0.9
+
+
+def test_a_bend_makes_a_mesh_less_sure(after: Refined) -> None:
+    """A sphere bends by its edge squared over its radius; a plane not at all."""
+    edge, radius = 0.3, 12.0
+    x, y = (edge * c.ravel() for c in np.meshgrid(np.arange(-15, 16), np.arange(-15, 16)))
+    dome = np.stack([x, y, np.sqrt(radius**2 - x**2 - y**2)], -1).astype(np.float32)
+    flat = np.stack([x, y, np.zeros_like(x)], -1).astype(np.float32)
+    first = (31 * np.arange(30)[:, None] + np.arange(30)).ravel()
+    triangles = np.concatenate([
+        np.stack([first, first + 1, first + 31], -1), np.stack([first + 1, first + 32, first + 31], -1)
+    ]).astype(np.int32)  # fmt: skip
+    grey = np.zeros((len(x), 3), np.uint8)
+    normals = (dome / np.linalg.norm(dome, axis=1, keepdims=True)).astype(np.float32)
+    round_mm = bend_mm(Mesh(dome, triangles, normals, grey))
+    middle = np.hypot(x, y) < 2
+    # Four edges along the grid, two diagonals that are longer by the root of two.
+    assert round_mm[middle] == pytest.approx(edge**2 / radius * (4 + 2 * 2) / 6, rel=0.05)
+    upright = np.tile(np.array([0, 0, 1], np.float32), (len(x), 1))
+    assert bend_mm(Mesh(flat, triangles, upright, grey)) == pytest.approx(0.0, abs=1e-7)
+    before = Evidence.of(after, np.full(len(after.views), 0.1, np.float32))
+    assert (replace(before, bend=np.zeros_like(before.bend)).sigma() <= before.sigma()).all()
+
+
+def test_support_is_the_share_of_the_surroundings_that_photos_told(after: Refined) -> None:
+    everywhere = replace(after, found=np.isfinite(after.sharpness))
+    refined = np.isfinite(after.sharpness)
+    assert support(everywhere)[refined] == pytest.approx(1.0, abs=1e-5)
+    nowhere = replace(after, found=np.zeros_like(after.found))
+    assert support(nowhere) == pytest.approx(LEAST_SUPPORT)
+    left = replace(after, found=refined & (after.mesh.vertices[:, 0] < 0))
+    share, x = support(left)[refined], after.mesh.vertices[refined, 0]
+    assert share[x < -3].min() > 0.95
+    assert share[x > 3].max() == pytest.approx(LEAST_SUPPORT, abs=0.05)
+    assert 0.3 < np.median(share[np.abs(x) < 0.1]) < 0.7
 
 
 def test_photos_that_agree_on_nothing_leave_the_scatter_of_the_depths(after: Refined) -> None:

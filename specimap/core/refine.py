@@ -15,12 +15,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
 
 from specimap.core.consistency import Photographs, choose_views, patch_scores
 from specimap.core.geometry import Floats, Intrinsics, Pose
 from specimap.core.progress import within
-from specimap.core.surface import Mesh, vertex_normals
+from specimap.core.surface import Mesh, edges_between, vertex_normals
 
 CHUNK = 2048
 
@@ -31,13 +30,15 @@ class Refined:
 
     ``views`` (V,): photos that were compared at a vertex, 0 where none were. ``agreement`` (V,): their mean correlation
     at the best offset. ``sharpness`` (V,), 1/mm^2: how fast it falls off along the normal, its curvature times its
-    height; 0 where it has no top within reach. Both NaN where the vertex was not refined.
+    height; 0 where it has no top within reach. Both NaN where the vertex was not refined. ``found`` (V,): whether
+    enough photos agreed on the vertex's place; the others follow their neighbours.
     """
 
     mesh: Mesh
     views: NDArray[np.uint8]
     agreement: NDArray[np.float32]
     sharpness: NDArray[np.float32]
+    found: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ def refine_mesh(
     cost = [p.steps * p.views for p in settings.passes]
     count = len(mesh.vertices)
     unknown = np.full(count, np.nan, np.float32)
-    refined = Refined(mesh, np.zeros(count, np.uint8), unknown, unknown)
+    refined = Refined(mesh, np.zeros(count, np.uint8), unknown, unknown, np.zeros(count, bool))
     for k, one in enumerate(settings.passes):
         done, share = sum(cost[:k]) / sum(cost), cost[k] / sum(cost)
         refined = _refined_once(
@@ -149,8 +150,10 @@ def _refined_once(
     compared, agreement, sharpness = start.views.copy(), start.agreement.copy(), start.sharpness.copy()
     compared[chosen], agreement[chosen] = (views >= 0).sum(1), top
     sharpness[chosen] = sharp / (offsets[1] - offsets[0]) ** 2
+    found = start.found.copy()
+    found[chosen] = sure
     after = Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), mesh.colours)
-    return Refined(after, compared, agreement, sharpness)
+    return Refined(after, compared, agreement, sharpness, found)
 
 
 def _best_offsets(scores: NDArray[np.float32], offsets: Floats) -> tuple[Floats, Floats]:
@@ -167,17 +170,9 @@ def _best_offsets(scores: NDArray[np.float32], offsets: Floats) -> tuple[Floats,
     return offsets[middle] + shift * step, np.where(inner, -bend * np.maximum(centre, 0), 0.0)
 
 
-def _edges(triangles: NDArray[np.int32], n: int) -> csr_array:
-    """Which of ``n`` vertices share an edge, (n, n), 1 where they do."""
-    a, b = triangles[:, [0, 1, 2]].ravel(), triangles[:, [1, 2, 0]].ravel()
-    edges = coo_array((np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, a])), shape=(n, n)).tocsr()
-    edges.data[:] = 1.0
-    return edges
-
-
 def _smoothed(best: Floats, weight: Floats, triangles: NDArray[np.int32], settings: RefineSettings) -> Floats:
     """Offsets (V,) that follow ``best`` by ``weight`` and their neighbours for the rest (Jacobi rounds)."""
-    edges = _edges(triangles, len(best))
+    edges = edges_between(triangles, len(best))
     degree = np.asarray(edges.sum(1)).ravel()
     out = np.where(weight > 0, best, 0.0)
     for _ in range(settings.smoothing_rounds):

@@ -1,10 +1,11 @@
 """One standard deviation of a point's position, so that what is stated holds.
 
 What a point's error depends on was looked for on phantoms: how fast the photos' agreement falls off along the normal
-(sharp photos and rich texture make it fall fast) and how far it is from perfect, how many photos were compared at the
-place, where the surface breaks off for the cube's camera, which turns a sideways error into a height, and what markers
-and specimen leave open of that camera. The shares of these were set on six specimens, so that 68 % of the errors lie
-within one and 95 % within two; docs/accuracy.md has what came of it on others.
+(sharp photos and rich texture make it fall fast), how many photos were compared at the place, how much of its
+surroundings they agreed on, how much the surface bends, since patches flatten it, where it breaks off for the cube's
+camera, which turns a sideways error into a height, and what markers and specimen leave open of that camera. How much
+each counts is set by a rule on some specimens (``bench/sigma.py``), so that 68 % of the errors lie within one and 95 %
+within two; docs/accuracy.md has what came of it on others.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap.core.geometry import Pose
+from specimap.core.geometry import Floats, Pose
 from specimap.core.reconstruct.depth import DepthMap
 from specimap.core.refine import Refined
 from specimap.core.robust import SIGMA_OF_MAD
-from specimap.core.surface import Mesh
+from specimap.core.surface import Mesh, edges_between
 
 AGREEMENT_MM = 1.5
 """Depths farther from the mesh than this see another surface (an occluder), not this one badly."""
@@ -34,6 +35,9 @@ LEAST_COSINE = 0.15
 MOST_VIEWS = 9
 MOST_UNLIKE = 16.0
 """A vertex counts as at most this much sharper or less sharp than is usual: beyond, its own figure is chance."""
+SUPPORT_ROUNDS = 8
+"""Steps from vertex to vertex, half of each back: about two edges of the mesh, one standard deviation."""
+LEAST_SUPPORT = 0.05
 STEP_REACH_MM = 0.17
 STEEP_MM = 2 * STEP_REACH_MM * float(np.tan(np.radians(60)))
 """A flank of 60 degrees rises by so much within the reach; what is more is a jump."""
@@ -43,42 +47,86 @@ STEEP_MM = 2 * STEP_REACH_MM * float(np.tan(np.radians(60)))
 class Shares:
     """What a standard deviation is made of, as ``python -m bench --only sigma`` sets it.
 
-    ``of_width``: standard deviation of a vertex along its normal as a share of the width of the photos' agreement
-    there, where they agree perfectly and all that can be are compared. ``of_disagreement``: by how much more of itself
-    it is larger where they do not agree at all. ``of_jump``: share of a jump of the surface within a cube pixel's reach
-    that a sideways error turns into height.
+    ``of_width``: of the width of the photos' agreement about its top along the normal. ``of_bend``: of the surface's
+    bend over an edge of the mesh (:func:`bend_mm`). ``of_jump``: of a jump of the surface within a cube pixel's reach,
+    which a sideways error turns into height.
     """
 
-    of_width: float = 0.136
-    of_disagreement: float = 0.4
-    of_jump: float = 0.75
+    of_width: float = 0.0588
+    of_bend: float = 0.874
+    of_jump: float = 0.412
 
 
 SHARES = Shares()
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What is known of a mesh's V vertices: ``scatter`` (V,) mm of the depth maps; which were ``measured`` (V,) by
+    comparing photos, and of these n the ``width_mm`` (n,) of the photos' agreement about its top, as if all that can be
+    had been compared, ``bend`` (n,) mm (:func:`bend_mm`) and ``support`` (n,) (:func:`support`).
+    """
+
+    scatter: NDArray[np.float32]
+    measured: NDArray[np.bool_]
+    width_mm: Floats
+    bend: NDArray[np.float32]
+    support: NDArray[np.float32]
+
+    @staticmethod
+    def of(refined: Refined, scatter: NDArray[np.float32]) -> Evidence:
+        """Of a refined mesh, with the standard deviation (V,) of its depth maps (:func:`vertex_scatter`)."""
+        done = (refined.views > 0) & np.isfinite(refined.sharpness)
+        topped = refined.sharpness[done & (refined.sharpness > 0)]
+        # Where no depth map sees the place, what the photos agree on may be anything.
+        measured = done & (scatter < UNSEEN_SIGMA_MM) & (len(topped) > 0)
+        usual = float(np.median(topped)) if len(topped) else 1.0
+        sharpness = np.clip(refined.sharpness[measured], usual / MOST_UNLIKE, usual * MOST_UNLIKE)
+        fewer = MOST_VIEWS / np.maximum(refined.views[measured], 1)
+        return Evidence(
+            scatter,
+            measured,
+            np.sqrt(fewer / sharpness),
+            bend_mm(refined.mesh)[measured],
+            support(refined)[measured],
+        )
+
+    def sigma(self, shares: Shares = SHARES) -> NDArray[np.float32]:
+        """Standard deviation (V,) mm along the normal."""
+        alone = np.hypot(shares.of_width * self.width_mm, shares.of_bend * self.bend)
+        sigma = self.scatter.copy()
+        sigma[self.measured] = alone / np.sqrt(self.support)
+        return np.clip(sigma, LEAST_SIGMA_MM, UNSEEN_SIGMA_MM).astype(np.float32)
 
 
 def mesh_sigma(
     refined: Refined, maps: tuple[DepthMap, ...], poses: tuple[Pose, ...], *, workers: int = 1
 ) -> NDArray[np.float32]:
     """Standard deviation (V,) mm of a refined mesh's vertices."""
-    return refined_sigma(refined, vertex_scatter(refined.mesh, maps, poses, workers=workers))
+    return Evidence.of(refined, vertex_scatter(refined.mesh, maps, poses, workers=workers)).sigma()
 
 
-def refined_sigma(refined: Refined, scatter: NDArray[np.float32], shares: Shares = SHARES) -> NDArray[np.float32]:
-    """Standard deviation (V,) mm of a refined mesh's vertices, given that of its depth maps (:func:`vertex_scatter`),
-    which holds where the photos were not compared."""
-    done = (refined.views > 0) & np.isfinite(refined.sharpness)
-    if not (refined.sharpness[done] > 0).any():
-        return scatter
-    # Where no depth map sees the place, what the photos agree on may be anything.
-    measured = done & (scatter < UNSEEN_SIGMA_MM)
-    usual = float(np.median(refined.sharpness[done & (refined.sharpness > 0)]))
-    sharpness = np.clip(refined.sharpness[measured], usual / MOST_UNLIKE, usual * MOST_UNLIKE)
-    fewer = MOST_VIEWS / np.maximum(refined.views[measured], 1)
-    sigma = scatter.copy()
-    apart = 1 + shares.of_disagreement * (1 - np.clip(refined.agreement[measured], 0, 1))
-    sigma[measured] = shares.of_width * apart * np.sqrt(fewer / sharpness)
-    return np.clip(sigma, LEAST_SIGMA_MM, UNSEEN_SIGMA_MM).astype(np.float32)
+def bend_mm(mesh: Mesh) -> NDArray[np.float32]:
+    """How far (V,) mm a mesh bends away over one of its edges: edge length times the angle between the normals at its
+    ends, mean over a vertex's edges. Comparing patches flattens a surface in proportion."""
+    edges = edges_between(mesh.triangles, len(mesh.vertices)).tocoo()
+    a, b = edges.row, edges.col
+    length = np.linalg.norm(mesh.vertices[a] - mesh.vertices[b], axis=1)
+    bend = np.linalg.norm(mesh.normals[a] - mesh.normals[b], axis=1) * length
+    count = np.maximum(np.bincount(a, minlength=len(mesh.vertices)), 1)
+    return np.asarray(np.bincount(a, bend, len(mesh.vertices)) / count, np.float32)
+
+
+def support(refined: Refined) -> NDArray[np.float32]:
+    """Share (V,) of the surroundings, as far as they were refined, on whose places enough photos agreed: the others
+    follow their neighbours, and err as these do only near by. At least ``LEAST_SUPPORT``."""
+    edges = edges_between(refined.mesh.triangles, len(refined.mesh.vertices))
+    degree = np.maximum(np.asarray(edges.sum(1)).ravel(), 1)
+    refining = np.isfinite(refined.sharpness)
+    shares = np.stack([refined.found & refining, refining], -1).astype(float)
+    for _ in range(SUPPORT_ROUNDS):
+        shares = (shares + (edges @ shares) / degree[:, None]) / 2
+    return np.asarray(np.maximum(shares[:, 0] / np.maximum(shares[:, 1], 1e-9), LEAST_SUPPORT), np.float32)
 
 
 def vertex_scatter(

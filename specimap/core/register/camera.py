@@ -22,8 +22,9 @@ FOCAL_RANGE = (0.7, 30.0)
 FOCAL_STARTS = 24
 FOCAL_PRIOR_SD = float(np.log(FOCAL_RANGE[1] / FOCAL_RANGE[0])) / 4
 """Standard deviation of the logarithm of the focal length about the middle of the range: only keeps it finite."""
-LEAST_SCATTER = 0.2
-"""Corners fit better than they were said to by chance, too: their variance is not taken for less than this share."""
+LEAST_SCATTER = 0.5
+"""Corners fit together better than they lie, by chance and since their errors share parts: their variance is not taken
+for less than this share of what was said."""
 
 
 @dataclass(frozen=True)

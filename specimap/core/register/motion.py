@@ -40,8 +40,9 @@ LEAST_CLEAR = 1.25
 LEAST_AGREE = 0.6
 LEAST_MARKERS = 4
 """Three nearly coplanar markers leave the cube's focal length open: raised tissue then seems to have moved."""
-SHARED_MM = 0.03
-"""What surface and registration shift together, one sd: 0.01 to 0.03 mm on specimens that did not move."""
+SHARED_MM = 0.02
+"""What all tiles are off together, one sd: seen through the true camera, specimens that did not move show 0.00 to 0.01
+mm on own phantoms and 0.02 to 0.03 mm on path-traced ones."""
 ALLOWED_MM = 0.3
 ALLOWED_SIGMA = 4.0
 
