@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -16,6 +17,8 @@ from specimap.core.surface import Mesh
 Singles = NDArray[np.float32]
 Indices = NDArray[np.int64]
 
+CHUNK = 8192
+"""Vertices whose views are chosen at a time."""
 NOISE_VARIANCE = 4.0
 """Variance in grey levels that a patch is given on top of its own, so that plain areas do not count as agreeing."""
 PATCH_SIGMA = 0.75
@@ -42,7 +45,7 @@ class Photographs:
 
 
 def choose_views(
-    mesh: Mesh, chosen: Indices, photographs: Photographs, most: int, least_cosine: float
+    mesh: Mesh, chosen: Indices, photographs: Photographs, most: int, least_cosine: float, *, workers: int = 1
 ) -> Indices:
     """For each of the ``chosen`` (n,) vertices the photos that are compared there, (n, most), -1 where there are fewer:
     those that see it most squarely and unhidden, and not in a highlight.
@@ -50,15 +53,23 @@ def choose_views(
     Highlights move over the surface with the camera and lie where the lamp's mirror image is, below it: photos that
     agree on them agree on a wrong place.
     """
-    views = _squarest(mesh, chosen, photographs, most + SPARE_BEFORE_HIGHLIGHTS, least_cosine)
+    views = np.empty((len(chosen), most + SPARE_BEFORE_HIGHLIGHTS), np.int64)
+    caster = RayCaster(mesh)
+    caster.cast(np.zeros(3), np.array([[0.0, 0.0, 1.0]]))  # builds the tree, which threads must not do at once
+
+    def run(part: slice) -> None:
+        views[part] = _squarest(caster, chosen[part], photographs, views.shape[1], least_cosine)
+
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(run, [slice(k, k + CHUNK) for k in range(0, len(chosen), CHUNK)]))
     views[_highlights(mesh.vertices[chosen].astype(float), views, photographs)] = -1
     order = np.argsort(views < 0, axis=1, kind="stable")[:, :most]
     return np.take_along_axis(views, order, 1)
 
 
-def _squarest(mesh: Mesh, chosen: Indices, photographs: Photographs, most: int, least_cosine: float) -> Indices:
+def _squarest(caster: RayCaster, chosen: Indices, photographs: Photographs, most: int, least_cosine: float) -> Indices:
     """The photos that see each vertex most squarely and unhidden, (n, most); -1 where there are fewer."""
-    lens, poses = photographs.lens, photographs.poses
+    mesh, lens, poses = caster.mesh, photographs.lens, photographs.poses
     points, normals = mesh.vertices[chosen].astype(float), mesh.normals[chosen].astype(float)
     cosine = np.empty((len(poses), len(points)), np.float32)
     for k, pose in enumerate(poses):
@@ -76,7 +87,7 @@ def _squarest(mesh: Mesh, chosen: Indices, photographs: Photographs, most: int, 
     away = centres[order[rank, vertex]] - points[vertex]
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     clearance = 0.4 * away + 0.15 * normals[vertex]
-    hidden = RayCaster(mesh).cast(points[vertex] + clearance, away).hit
+    hidden = caster.cast(points[vertex] + clearance, away).hit
     seen[rank[hidden], vertex[hidden]] = False
     place = np.cumsum(seen, axis=0)
     seen &= place <= most

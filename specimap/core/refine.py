@@ -44,12 +44,14 @@ class Refined:
 @dataclass(frozen=True)
 class Pass:
     """One round: the farthest offset ``reach_voxels``, how many ``steps`` are tried, ``views`` compared;
-    ``half_samples``: the patch is (2 n + 1)^2 samples, a photo's pixel apart on the surface."""
+    ``half_samples``: the patch is (2 n + 1)^2 samples, a photo's pixel apart on the surface; ``keep_views``: compare
+    the photos of the round before, which choosing anew would hardly change."""
 
     reach_voxels: float
     steps: int
     views: int
     half_samples: int = 2
+    keep_views: bool = False
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class RefineSettings:
     neighbours.
     """
 
-    passes: tuple[Pass, ...] = (Pass(2.0, 11, 9), Pass(0.8, 5, 9), Pass(0.5, 5, 9, half_samples=1))
+    passes: tuple[Pass, ...] = (Pass(2.0, 11, 9), Pass(0.8, 5, 9), Pass(0.5, 5, 9, half_samples=1, keep_views=True))
     least_score: float = 0.3
     smoothness: float = 0.2
     smoothing_rounds: int = 10
@@ -95,10 +97,15 @@ def refine_mesh(
     count = len(mesh.vertices)
     unknown = np.full(count, np.nan, np.float32)
     refined = Refined(mesh, np.zeros(count, np.uint8), unknown, unknown, np.zeros(count, bool))
-    for k, one in enumerate(settings.passes):
+    views: NDArray[np.int64] | None = None
+    for k, one in enumerate(settings.passes if len(chosen) else ()):
         done, share = sum(cost[:k]) / sum(cost), cost[k] / sum(cost)
+        if views is None or not one.keep_views:
+            views = choose_views(refined.mesh, chosen, photographs, one.views, settings.least_cosine, workers=workers)
+        progress(done + 0.2 * share)
         refined = _refined_once(
-            refined, chosen, photographs, voxel_mm, settings, one, workers, within(progress, done, done + share)
+            refined, chosen, views, photographs, voxel_mm, settings, one, workers,
+            within(progress, done + 0.2 * share, done + share),
         )  # fmt: skip
     progress(1.0)
     return refined
@@ -107,6 +114,7 @@ def refine_mesh(
 def _refined_once(
     start: Refined,
     chosen: NDArray[np.int64],
+    views: NDArray[np.int64],
     photographs: Photographs,
     voxel_mm: float,
     settings: RefineSettings,
@@ -114,13 +122,9 @@ def _refined_once(
     workers: int,
     progress: Callable[[float], None],
 ) -> Refined:
-    """One pass over the ``chosen`` vertices."""
+    """One pass over the ``chosen`` (n,) vertices, by the photos in ``views`` (n, k)."""
     mesh = start.mesh
     points, normals = mesh.vertices[chosen].astype(float), mesh.normals[chosen].astype(float)
-    if not len(points):
-        return start
-    views = choose_views(mesh, chosen, photographs, one.views, settings.least_cosine)
-    progress(0.2)
     reach = one.reach_voxels * voxel_mm
     offsets = np.linspace(-reach, reach, one.steps)
     sample_mm = pixel_footprint_mm(photographs.lens, photographs.poses, points.mean(0))
@@ -134,7 +138,7 @@ def _refined_once(
     parts = [slice(k, k + CHUNK) for k in range(0, len(points), CHUNK)]
     with ThreadPoolExecutor(workers) as pool:
         for done, _ in enumerate(pool.map(run, parts), 1):
-            progress(0.2 + 0.7 * done / len(parts))
+            progress(0.9 * done / len(parts))
     best, sharp = _best_offsets(scores, offsets)
     top = scores.max(1)
     sure = ((views >= 0).sum(1) >= 3) & (top > settings.least_score)
