@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
+from bench.service.sheet import NONE, Sheet
 from specimap.core.acquisition import AcquisitionSettings, Photo, photo_paths, read_photos
 from specimap.core.errors import SpecimapError
 from specimap.core.geometry import Floats, Pose, fit_similarity
@@ -61,17 +61,8 @@ class Outcome:
 
 def bench_features(console: Console, work: Path, repeats: int) -> dict[str, object]:
     """Each case by each kind of features; the fastest of ``repeats`` gives the seconds."""
-    table = Table(
-        title=f"{PHOTOS} photos, markers read in {WITH_MARKERS} neighbours only; the rest by features",
-        title_justify="left",
-    )
-    for heading in (
-        "texture", "gloss", "cards", "features", "photos posed", "pose deg", "pose mm", "worst mm", "surface mm",
-        "seconds", "CPU s",
-    ):  # fmt: skip
-        table.add_column(heading, justify="left" if heading in ("cards", "features") else "right")
     kinds = KINDS[:1] if aliked_missing() else KINDS
-    figures: dict[str, object] = {}
+    rows: list[list[object]] = []
     for texture, gloss, cards in CASES:
         folder = work / f"features_{texture}_{gloss}_{cards}"
         settings = PhantomSettings(
@@ -86,21 +77,34 @@ def bench_features(console: Console, work: Path, repeats: int) -> dict[str, obje
         for kind in kinds:
             runs = [_run(photos, corners, truth, kind) for _ in range(repeats)]
             found = [r for r in runs if isinstance(r, Outcome)]
-            row = [f"{texture:g}", f"{gloss:g}", "shown" if cards else "none", kind]
-            if not found:
-                table.add_row(*row, str(runs[0]), *"------")
-                figures[" ".join(row)] = str(runs[0])
-                continue
-            best = min(found, key=lambda r: r.seconds)
-            table.add_row(
-                *row, f"{best.photos} of {PHOTOS}", f"{best.deg:.2f}", f"{best.mm:.3f}", f"{best.worst_mm:.2f}",
-                f"{best.surface_mm:.3f}", f"{best.seconds:.1f}", f"{best.cpu_s:.1f}",
-            )  # fmt: skip
-            figures[" ".join(row)] = vars(best)
-    console.print(table)
+            rows.append([
+                f"{texture:g}", f"{gloss:g}", "shown" if cards else "none", kind,
+                vars(min(found, key=lambda r: r.seconds)) if found else str(runs[0]),
+            ])  # fmt: skip
+    figures: dict[str, object] = {"rows": rows}
+    sheet_features(figures).show(console)
     if len(kinds) < len(KINDS):
         console.print("ALIKED is not installed: SIFT alone was measured.")
     return figures
+
+
+def sheet_features(figures: dict[str, Any]) -> Sheet:
+    """The table of kept figures."""
+    sheet = Sheet(
+        f"{PHOTOS} photos, markers read in {WITH_MARKERS} neighbours only; the rest by features",
+        ("texture", "gloss", "cards", "features", "photos posed", "pose, degrees", "pose, mm", "worst, mm",
+         "surface, mm", "seconds", "CPU s"),
+    )  # fmt: skip
+    for *case, found in figures["rows"]:
+        if isinstance(found, str):
+            sheet.rows.append([*case, found, *[NONE] * 6])
+            continue
+        best = Outcome(**found)
+        sheet.rows.append([
+            *case, f"{best.photos} of {PHOTOS}", f"{best.deg:.2f}", f"{best.mm:.3f}", f"{best.worst_mm:.2f}",
+            f"{best.surface_mm:.3f}", f"{best.seconds:.1f}", f"{best.cpu_s:.1f}",
+        ])  # fmt: skip
+    return sheet
 
 
 def _neighbours(settings: PhantomSettings) -> list[int]:

@@ -1,4 +1,4 @@
-"""``python -m bench.tables``: the newest records into README.md, docs/accuracy.md and docs/performance.md.
+"""``python -m bench.tables``: the newest records into README.md and pages of docs/.
 
 They go between marks in these pages.
 """
@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from bench.features import sheet_features
 from bench.growth import sheet_growth
 from bench.machine import in_words
 from bench.photos import sheet_photos
@@ -111,6 +112,7 @@ def main() -> None:
         put(ROOT / "docs" / "accuracy.md", "apple", real_line(figures[REAL]))
     put(ROOT / "docs" / "accuracy.md", "budget", budget_table(newest("budget")))
     put(ROOT / "docs" / "accuracy.md", "sigma", sheet_sigma(newest("sigma")).markdown())
+    put(ROOT / "docs" / "backends.md", "features", sheet_features(newest("features")).markdown())
     for part in OF_RUNS:
         put(ROOT / "docs" / "performance.md", part, run_tables(part, newest_record(part)))
     for part in PARTS:

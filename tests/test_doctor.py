@@ -107,6 +107,15 @@ def test_an_interpreter_tells_what_it_imports() -> None:
     assert "failed" in probe("/nowhere/python", ("numpy",))
 
 
+def test_one_command_brings_all_missing_modules(bare: pytest.MonkeyPatch) -> None:
+    reasons = {"safetensors": "not installed", "torch": "libgomp.so.1 is absent", "einops": "not installed"}
+    bare.setattr(availability, "probe", lambda python, modules: {"modules": {}, "missing": reasons})
+    found = next(p for p in availability.diagnose().parts if p.name == "da3")
+    (missing,) = [m for m in found.missing if "pip install" in m.do]
+    assert missing.what == "safetensors, einops: not installed; torch: libgomp.so.1 is absent"
+    assert "pip install safetensors einops torch;" in missing.do
+
+
 def test_the_default_backends_libraries_answer_soon() -> None:
     started = time.process_time()
     began = time.monotonic()

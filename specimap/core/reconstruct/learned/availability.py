@@ -207,10 +207,17 @@ def driver_gpus() -> tuple[dict[str, Any], ...]:
         return ()
 
 
-def _missing(found: dict[str, Any], do: Callable[[str], str]) -> list[Missing]:
+def _missing(found: dict[str, Any], do: Callable[[list[str]], str]) -> list[Missing]:
+    """What is missing of an interpreter's modules, as one thing to do, however many they are."""
     if "failed" in found:
-        return [Missing(f"the interpreter does not answer: {found['failed']}", do(""))]
-    return [Missing(f"{name}: {why}", do(name)) for name, why in found.get("missing", {}).items()]
+        return [Missing(f"the interpreter does not answer: {found['failed']}", do([]))]
+    by_reason: dict[str, list[str]] = {}
+    for name, why in found.get("missing", {}).items():
+        by_reason.setdefault(why, []).append(name)
+    if not by_reason:
+        return []
+    said = "; ".join(f"{', '.join(names)}: {why}" for why, names in by_reason.items())
+    return [Missing(said, do([name for names in by_reason.values() for name in names]))]
 
 
 def _usable(
@@ -244,10 +251,10 @@ class _Plan:
         missing += _missing(found, self._install)
         return _usable(self.name, "backend", found, missing, facts)
 
-    def _install(self, module: str) -> str:
-        if not module:
+    def _install(self, modules: list[str]) -> str:
+        if not modules:
             return f"Correct {self.prefix}PYTHON."
-        return install_command(self.python, [module], self.prefix)
+        return install_command(self.python, modules, self.prefix)
 
 
 def _weights_facts(weights: Weights) -> dict[str, Any]:
@@ -291,9 +298,9 @@ def install_command(python: str, modules: list[str], prefix: str) -> str:
     return f"{python} -m pip install {what}"
 
 
-def _install_pipeline(_module: str) -> str:
+def _install_pipeline(_modules: list[str]) -> str:
     return "pip install 'specimap[pipeline]'"
 
 
-def _install_learned(_module: str) -> str:
+def _install_learned(_modules: list[str]) -> str:
     return "make learned"
