@@ -52,12 +52,15 @@ class Scene:
         return views[0].intrinsics, poses, corners
 
     def placed(self, caster: RayCaster, view: View) -> tuple[Placement, NDArray[np.intp], Floats]:
-        """Where ``view`` casts the cube's pixels; which places (n,) are the specimen's, and their errors (n,) mm."""
+        """Where ``view`` casts the cube's pixels; which places (n,) are the specimen's, as far as their truth is known,
+        and their errors (n,) mm."""
         placed = place_by_camera(view, caster, False)
         rows, cols = placed.pixels[:, 0], placed.pixels[:, 1]
         at = np.flatnonzero(self.truth.hsi_class[rows, cols] == SPECIMEN)
         true = self.ours.apply(self.truth.hsi_xyz[rows[at], cols[at]].astype(float))
-        return placed, at, np.linalg.norm(placed.xyz[at] - true, axis=1)
+        errors = np.linalg.norm(placed.xyz[at] - true, axis=1)
+        known = np.isfinite(errors)
+        return placed, at[known], errors[known]
 
 
 def scaled_maps(stage1: Stage1, stage2: Stage2) -> tuple[DepthMap, ...]:

@@ -135,7 +135,7 @@ def fitted(specimens: Sequence[Specimen]) -> Shares:
     def loss(x: Floats) -> float:
         return float(np.mean([one.loss(Shares(*np.exp(x))) for one in specimens]))
 
-    found = minimize(loss, np.log(astuple(SHARES)), method="Nelder-Mead", options={"xatol": 0.01, "fatol": 1e-3})
+    found = minimize(loss, np.log(astuple(SHARES)), method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-4})
     return Shares(*(float(x) for x in np.exp(found.x)))
 
 
@@ -159,8 +159,6 @@ def specimen(folder: Path, scratch: Path) -> Specimen:
     )
     scene = Scene(folder, load_truth(folder), stage1, stage2, settings)
     placed, at, errors = scene.placed(scene.caster, scene.camera)
-    known = np.isfinite(errors)
-    at, errors = at[known], errors[known]
     return Specimen(
         Evidence.of(refined, vertex_scatter(refined.mesh, maps, adjusted.poses, workers=workers)),
         scene.caster,

@@ -15,7 +15,8 @@ from typer.testing import CliRunner
 
 from specimap.cli.doctor import doctor
 from specimap.core.reconstruct.learned import availability
-from specimap.core.reconstruct.learned.availability import Diagnosis, Machine, Missing, Usable, driver_gpus, probe
+from specimap.core.reconstruct.learned.availability import Diagnosis, Machine, Missing, Usable
+from specimap.core.reconstruct.learned.probing import driver_gpus, probe
 from specimap.core.reconstruct.mast3r.settings import NEEDED
 
 app = typer.Typer()

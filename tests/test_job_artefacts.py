@@ -19,15 +19,16 @@ from specimap.infra.storage import Storage
 from specimap.workers.artefacts import Artefacts
 
 JOBS = 6
-STORED = threading.Barrier(JOBS)
 
 
 class Together(Storage):
     """Lets nobody go on who has stored a file until all have."""
 
+    stored: threading.Barrier
+
     def put_file(self, key: str, source: Path) -> None:
         super().put_file(key, source)
-        STORED.wait(20)
+        self.stored.wait(20)
 
 
 def running(tables: Database, acquisition: str) -> str:
@@ -55,6 +56,7 @@ def test_of_jobs_that_finish_a_stage_at_once_one_artefact_stays(tables: Database
             )
         )
     storage = Together.open(load_settings(data_dir=tmp_path / "data"))
+    storage.stored = threading.Barrier(JOBS)
     artefacts = Artefacts(tables, storage, acquisition)
 
     def finish(number: int) -> str:

@@ -8,6 +8,7 @@ of several is held tighter.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,11 +17,13 @@ from specimap.core.evidence.truth import judge_with_sigma
 from specimap.core.phantom import PhantomSettings, write_phantom
 from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline
 
-MEDIUM = {"photos": 18, "photo_size": 448, "cube_rows": 256, "cube_cols": 320, "bands": 16, "mesh_divisions": 96}
+MEDIUM: dict[str, Any] = {
+    "photos": 18, "photo_size": 448, "cube_rows": 256, "cube_cols": 320, "bands": 16, "mesh_divisions": 96,
+}  # fmt: skip
 PHANTOMS = {
-    "sharp": PhantomSettings(seed=61, **MEDIUM),  # type: ignore[arg-type]
+    "sharp": PhantomSettings(seed=61, **MEDIUM),
     "blurred": PhantomSettings(
-        seed=62, blur_px=0.7, gloss=0.3, exposure_spread=0.2, card_tilt_deg=1.0, card_lift_mm=0.3, **MEDIUM  # type: ignore[arg-type]
+        seed=62, blur_px=0.7, gloss=0.3, exposure_spread=0.2, card_tilt_deg=1.0, card_lift_mm=0.3, **MEDIUM
     ),
 }
 ONE, TWO = 0.68, 0.95
@@ -64,7 +67,7 @@ def test_stated_deviations_hold_on_path_traced_tissue(data_dir: Path, tmp_path: 
 
 
 def test_stated_deviations_hold_where_they_were_set(data_dir: Path, tmp_path: Path) -> None:
-    assert_near(shares_of(data_dir / "phantom_a", tmp_path / "out"), 0.10, 0.06)
+    assert_near(shares_of(data_dir / "phantom_a", tmp_path / "out"), 0.06, 0.04)
 
 
 def assert_near(shares: Shares, allowed_one: float, allowed_two: float) -> None:

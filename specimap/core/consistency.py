@@ -55,7 +55,6 @@ def choose_views(
     """
     views = np.empty((len(chosen), most + SPARE_BEFORE_HIGHLIGHTS), np.int64)
     caster = RayCaster(mesh)
-    caster.cast(np.zeros(3), np.array([[0.0, 0.0, 1.0]]))  # builds the tree, which threads must not do at once
 
     def run(part: slice) -> None:
         views[part] = _squarest(caster, chosen[part], photographs, views.shape[1], least_cosine)

@@ -27,7 +27,7 @@ BATCH = 16
 """Edges whose profiles are sampled together: of like reach, and few enough to stay in the processor's cache."""
 EDGE_PX = 0.8
 """Sharper edges are blurred to this, one standard deviation: between pixels, interpolation puts an edge that is sharper
-up to a seventh of a pixel off, by where it lies between them, and all profiles alike where it runs along them."""
+up to 0.09 px off, by where it lies between them, and all profiles alike where it runs along them."""
 SOFTER_PX = 0.2
 """Blurs are multiples of this, so that the edges of a photo share a few blurred pictures."""
 MOST_BLUR = 1 / 40

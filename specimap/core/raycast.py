@@ -40,6 +40,8 @@ class RayCaster:
         self._triangles = TriangleMesh(
             self._scene, np.ascontiguousarray(mesh.vertices, np.float32), mesh.triangles.astype(np.int32)
         )
+        # The first ray builds the tree, which threads that cast side by side must not do at once.
+        self._scene.run(np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32))
 
     @cached_property
     def _reach(self) -> tuple[Floats, float]:

@@ -28,15 +28,14 @@ CHUNK = 2048
 class Refined:
     """A refined mesh, and how it came about.
 
-    ``views`` (V,): photos that were compared at a vertex, 0 where none were. ``agreement`` (V,): their mean correlation
-    at the best offset. ``sharpness`` (V,), 1/mm^2: how fast it falls off along the normal, its curvature times its
-    height; 0 where it has no top within reach. Both NaN where the vertex was not refined. ``found`` (V,): whether
-    enough photos agreed on the vertex's place; the others follow their neighbours.
+    ``views`` (V,): photos that were compared at a vertex, 0 where none were. ``sharpness`` (V,), 1/mm^2: how fast
+    their mean correlation falls off along the normal, its curvature times its height; 0 where it has no top within
+    reach, NaN where the vertex was not refined. ``found`` (V,): whether enough photos agreed on the vertex's place; the
+    others follow their neighbours.
     """
 
     mesh: Mesh
     views: NDArray[np.uint8]
-    agreement: NDArray[np.float32]
     sharpness: NDArray[np.float32]
     found: NDArray[np.bool_]
 
@@ -96,7 +95,7 @@ def refine_mesh(
     cost = [p.steps * p.views for p in settings.passes]
     count = len(mesh.vertices)
     unknown = np.full(count, np.nan, np.float32)
-    refined = Refined(mesh, np.zeros(count, np.uint8), unknown, unknown, np.zeros(count, bool))
+    refined = Refined(mesh, np.zeros(count, np.uint8), unknown, np.zeros(count, bool))
     views: NDArray[np.int64] | None = None
     for k, one in enumerate(settings.passes if len(chosen) else ()):
         done, share = sum(cost[:k]) / sum(cost), cost[k] / sum(cost)
@@ -140,8 +139,7 @@ def _refined_once(
         for done, _ in enumerate(pool.map(run, parts), 1):
             progress(0.9 * done / len(parts))
     best, sharp = _best_offsets(scores, offsets)
-    top = scores.max(1)
-    sure = ((views >= 0).sum(1) >= 3) & (top > settings.least_score)
+    sure = ((views >= 0).sum(1) >= 3) & (scores.max(1) > settings.least_score)
     weight = np.where(sure, sharp, 0.0)
     if not (weight > 0).any():
         return start
@@ -151,13 +149,11 @@ def _refined_once(
     moved = np.zeros(len(mesh.vertices))
     moved[chosen] = _smoothed(offset, trust, mesh.triangles, settings)[chosen]
     vertices = (mesh.vertices + moved[:, None] * mesh.normals).astype(np.float32)
-    compared, agreement, sharpness = start.views.copy(), start.agreement.copy(), start.sharpness.copy()
-    compared[chosen], agreement[chosen] = (views >= 0).sum(1), top
+    compared, sharpness, found = start.views.copy(), start.sharpness.copy(), start.found.copy()
+    compared[chosen], found[chosen] = (views >= 0).sum(1), sure
     sharpness[chosen] = sharp / (offsets[1] - offsets[0]) ** 2
-    found = start.found.copy()
-    found[chosen] = sure
     after = Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), mesh.colours)
-    return Refined(after, compared, agreement, sharpness, found)
+    return Refined(after, compared, sharpness, found)
 
 
 def _best_offsets(scores: NDArray[np.float32], offsets: Floats) -> tuple[Floats, Floats]:

@@ -52,9 +52,9 @@ class Shares:
     which a sideways error turns into height.
     """
 
-    of_width: float = 0.0588
-    of_bend: float = 0.874
-    of_jump: float = 0.412
+    of_width: float = 0.0543
+    of_bend: float = 0.87
+    of_jump: float = 0.416
 
 
 SHARES = Shares()

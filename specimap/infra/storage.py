@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 import obstore
 from obstore.store import LocalStore, S3Store
@@ -54,7 +55,7 @@ class Storage:
         self._scratch = scratch
 
     @classmethod
-    def open(cls, settings: ServiceSettings) -> Storage:
+    def open(cls, settings: ServiceSettings) -> Self:
         """Open the storage that the settings name.
 
         Raises:

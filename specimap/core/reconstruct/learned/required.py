@@ -6,8 +6,9 @@ import sys
 
 from specimap.core.errors import BackendUnavailableError
 from specimap.core.reconstruct.backend import ReconstructSettings
-from specimap.core.reconstruct.learned.availability import DEFAULT_BACKEND, install_command, probe
+from specimap.core.reconstruct.learned.availability import DEFAULT_BACKEND, install_command
 from specimap.core.reconstruct.learned.environment import backend_found
+from specimap.core.reconstruct.learned.probing import probe
 from specimap.core.reconstruct.mast3r.settings import NAME as MAST3R
 
 
