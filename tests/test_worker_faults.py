@@ -102,7 +102,7 @@ def test_a_frozen_worker_that_wakes_up_changes_nothing(yard: Shop, small: OnDisk
     frozen = yard.start()
     job_id = yard.submit(acquisition)
     pid = yard.held("adjust")
-    frozen.send_signal(signal.SIGSTOP)
+    yard.freeze(frozen)
     awake = yard.start()
     executor = yard.job(job_id).executor
     until(partial(taken_from, yard, job_id, executor), TAKEOVER_SECONDS, "the takeover")

@@ -5,12 +5,13 @@ from __future__ import annotations
 import hashlib
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -168,6 +169,33 @@ class Shop:
             return pid
 
         return int(until(living, seconds, f"stage {stage}"))
+
+    def freeze(self, worker: subprocess.Popen[bytes]) -> None:
+        """Stop a worker's process between two of its transactions: SQLite has one writer at a time, and one that is
+        stopped while it writes stops all others, whatever they do."""
+
+        def stopped_idle() -> bool:
+            worker.send_signal(signal.SIGSTOP)
+            # A process stops when it next would run: its state tells when it has.
+            state = Path(f"/proc/{worker.pid}/stat")
+            until(lambda: state.read_text().rsplit(")", 1)[1].split()[0] == "T", 5, "the stop")
+            if self._writable():
+                return True
+            worker.send_signal(signal.SIGCONT)
+            return False
+
+        until(stopped_idle, 20, "a stop between transactions")
+
+    def _writable(self) -> bool:
+        path = self.database.engine.url.database
+        assert path is not None
+        with closing(sqlite3.connect(path, timeout=0.2, isolation_level=None)) as connection:
+            try:
+                connection.execute("BEGIN IMMEDIATE")
+            except sqlite3.OperationalError:
+                return False
+            connection.execute("ROLLBACK")
+            return True
 
     def stop(self) -> None:
         """Kill all workers; none of their processes outlives them."""
