@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 
 from specimap.cli.progress import Listener
-from specimap.core.errors import CancelledError, SpecimapError
+from specimap.core.errors import CancelledError, MemoryExhaustedError, SpecimapError, StageFailedError
 
 REFUSED = 2
 """Exit status of a refused input."""
@@ -44,6 +44,12 @@ def stoppable() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
+def _status(error: SpecimapError) -> int:
+    if isinstance(error, CancelledError):
+        return STOPPED
+    return FAILED if isinstance(error, StageFailedError | MemoryExhaustedError) else REFUSED
+
+
 @contextmanager
 def told(listener: Listener, debug: bool) -> Iterator[None]:
     """Tell of any error by its code and advice, never by a traceback, and exit accordingly."""
@@ -53,7 +59,7 @@ def told(listener: Listener, debug: bool) -> Iterator[None]:
         if debug:
             traceback.print_exc()
         listener.refused(error)
-        raise typer.Exit(STOPPED if isinstance(error, CancelledError) else REFUSED) from None
+        raise typer.Exit(_status(error)) from None
     except BrokenPipeError:
         # Who reads the output has gone; Python would complain once more when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

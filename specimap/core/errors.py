@@ -209,6 +209,18 @@ class BackendFailedError(SpecimapError, RuntimeError):
     code = "backend_failed"
 
 
+class StageFailedError(SpecimapError, RuntimeError):
+    """A library failed inside a stage, on an input that no check foresaw; details name the stage."""
+
+    code = "stage_failed"
+
+
+class MemoryExhaustedError(SpecimapError, MemoryError):
+    """A stage needs more memory than it may take."""
+
+    code = "memory_exhausted"
+
+
 HTTP_STATUS: dict[type[SpecimapError], int] = {
     SpecimapError: 500,
     BackendFailedError: 500,
@@ -225,6 +237,7 @@ HTTP_STATUS: dict[type[SpecimapError], int] = {
     LabelInvalidError: 422,
     MarkerGeometryError: 422,
     MarkersMissingInCubeError: 422,
+    MemoryExhaustedError: 507,
     NoMarkersFoundError: 422,
     NotFoundError: 404,
     OutputExistsError: 409,
@@ -233,6 +246,7 @@ HTTP_STATUS: dict[type[SpecimapError], int] = {
     PhotosNotConnectedError: 422,
     RegistrationError: 422,
     SettingsError: 422,
+    StageFailedError: 500,
     StorageFullError: 507,
     TooFewPhotosError: 422,
     UnknownDictionaryError: 422,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,8 @@ from specimap.core.reconstruct.depth import DepthMap
 BLOCK_VOXELS = 8
 """Edge of a block of voxels: 16 touch twice the memory and time for the same surface."""
 FIRST_BLOCKS = 16_000
+NEAREST_MM = 1.0
+"""Depth from which on it counts: no lens is nearer."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ def fuse(
     """Fuse depth maps seen from ``poses`` (``cam_from_world`` of the photos they belong to) at ``voxel_mm``.
 
     Raises:
-        DepthNotFoundError: no voxel is seen often enough.
+        DepthNotFoundError: the maps hold no depth, or no voxel is seen often enough.
     """
     o3d = open3d()
     core = o3d.core
@@ -65,24 +67,31 @@ def fuse(
         ("tsdf", "weight", "color"), (core.float32, core.float32, core.float32), ((1,), (1,), (3,)),
         voxel_mm, BLOCK_VOXELS, FIRST_BLOCKS, core.Device("CPU:0"),
     )  # fmt: skip
-    for done, depth_map in enumerate(maps, 1):
+    touched = False
+    for done, depth_map in enumerate(map(_with_known_depth, maps), 1):
         view = depth_map.view(poses[depth_map.photo])
         depth = o3d.t.geometry.Image(np.ascontiguousarray(depth_map.depth))
         colour = o3d.t.geometry.Image(depth_map.colour.astype(np.float32) / 255)
         K = core.Tensor(view.intrinsics.matrix)
         T = core.Tensor(view.cam_from_world.matrix)
         far = float(depth_map.depth.max()) + 1.0
-        blocks = grid.compute_unique_block_coordinates(
-            depth, K, T, 1.0, far, settings.truncation_voxels
-        )
-        grid.integrate(blocks, depth, colour, K, K, T, 1.0, far, settings.truncation_voxels)
+        try:
+            blocks = grid.compute_unique_block_coordinates(
+                depth, K, T, NEAREST_MM, far, settings.truncation_voxels
+            )
+        except RuntimeError as error:
+            # Of every fourth pixel, which is what Open3D looks at, none has depth.
+            if "No block is touched" not in str(error):
+                raise
+            continue
+        touched = True
+        grid.integrate(blocks, depth, colour, K, K, T, NEAREST_MM, far, settings.truncation_voxels)
         progress(done / len(maps))
+    if not touched:
+        raise _no_surface()
     mesh = grid.extract_triangle_mesh(settings.least_weight)
     if "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
-        raise DepthNotFoundError(
-            "The photos gave no common surface.",
-            advice="Take sharper photos from 10-20 degrees apart, all around, with the specimen in the middle.",
-        )
+        raise _no_surface()
     vertices = mesh.vertex.positions.numpy()
     triangles = mesh.triangle.indices.numpy().astype(np.int32)
     colours = np.clip(mesh.vertex.colors.numpy() * 255, 0, 255).astype(np.uint8)
@@ -91,6 +100,18 @@ def fuse(
     )
     vertices, triangles, colours = _in_order(vertices, triangles, colours)
     return Mesh(vertices, triangles, vertex_normals(vertices, triangles), colours)
+
+
+def _with_known_depth(depth_map: DepthMap) -> DepthMap:
+    depth = depth_map.depth
+    return replace(depth_map, depth=np.where(np.isfinite(depth) & (depth > NEAREST_MM), depth, np.float32(0)))
+
+
+def _no_surface() -> DepthNotFoundError:
+    return DepthNotFoundError(
+        "The photos gave no common surface.",
+        advice="Take sharper photos from 10-20 degrees apart, all around, with the specimen in the middle.",
+    )
 
 
 def _in_order(

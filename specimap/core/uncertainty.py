@@ -160,9 +160,11 @@ def _distance_along_normals(mesh: Mesh, depth_map: DepthMap, pose: Pose) -> NDAr
     sight = centre - mesh.vertices
     cam = -sight @ view.cam_from_world.R.T.astype(np.float32)
     z = np.maximum(cam[:, 2], 1e-3)
-    column = np.rint(cam[:, 0] * np.float32(lens.focal_px) / z + np.float32(lens.cx)).astype(np.int32)
-    row = np.rint(cam[:, 1] * np.float32(lens.focal_px) / z + np.float32(lens.cy)).astype(np.int32)
     height, width = depth_map.depth.shape
+    x, y = (cam[:, k] * np.float32(lens.focal_px) / z + np.float32(c) for k, c in ((0, lens.cx), (1, lens.cy)))
+    # What lies far outside need not fit a whole number.
+    column = np.clip(np.rint(x), -1, width).astype(np.int32)
+    row = np.clip(np.rint(y), -1, height).astype(np.int32)
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     at = np.flatnonzero(inside)
     depth = depth_map.depth[row[at], column[at]]

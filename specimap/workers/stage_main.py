@@ -74,12 +74,6 @@ def main() -> None:
         _run(json.loads(line), out)
     except SpecimapError as error:
         _say(out, event="failed", error=error.as_dict())
-    except MemoryError:
-        refused = SpecimapError(
-            "The stage needs more memory than it may take.",
-            advice="Raise SPECIMAP_STAGE_MEMORY_BYTES, or use fewer photos.",
-        )
-        _say(out, event="failed", error=refused.as_dict())
     except OSError as error:
         if error.errno != 28:
             raise

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 from specimap.core.errors import CancelledError
+from specimap.core.pipeline.failures import told_as_stage_failure
 
 STAGES = ("reconstruct", "adjust", "render", "register")
 Progress = Callable[[str, float], None]
@@ -51,9 +52,10 @@ class Clock:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[Callable[[float], None]]:
-        """Time a stage; yields its progress function."""
+        """Time a stage; yields its progress function. What a library raises in it becomes a StageFailedError."""
         self._running = name, time.perf_counter()
         self.report(name, 0.0)
-        yield lambda share: self.report(name, share)
+        with told_as_stage_failure(name):
+            yield lambda share: self.report(name, share)
         self.seconds = self.so_far()
         self.report(name, 1.0)

@@ -11,6 +11,7 @@ from specimap.core.cube import Cube, inspect, open_cube
 from specimap.core.errors import NotFoundError
 from specimap.core.pipeline.artefacts import Stage1, Stage2, load_stage1, load_stage2
 from specimap.core.pipeline.clock import Clock, Progress
+from specimap.core.pipeline.failures import told_as_stage_failure
 from specimap.core.pipeline.outputs import Inputs, Outputs, prepare_folder
 from specimap.core.pipeline.settings import PipelineSettings
 
@@ -44,7 +45,9 @@ def run_stage(run: StageRun, *, progress: Progress, cancelled: Callable[[], bool
     run.settings.check()
     prepare_folder(run.out)
     clock = Clock(progress, cancelled, seconds=run.seconds, reused=run.reused)
-    {"reconstruct": _reconstruct, "adjust": _adjust, "render": _render, "register": _register}[run.stage](run, clock)
+    stages = {"reconstruct": _reconstruct, "adjust": _adjust, "render": _render, "register": _register}
+    with told_as_stage_failure(run.stage):
+        stages[run.stage](run, clock)
     return clock.seconds[run.stage]
 
 

@@ -89,8 +89,11 @@ def dense_depth(
     workers: int,
     progress: Callable[[float], None] = lambda share: None,
 ) -> list[DepthMap]:
-    """Depth maps of all pairs; ``images``: posed photos (H, W, 3), in the order of ``poses``."""
+    """Depth maps of all pairs; ``images``: posed photos (H, W, 3), in the order of ``poses``. None where no two photos
+    look from directions that can be matched."""
     pairs = choose_pairs(poses, volume.centre, settings)
+    if not pairs:
+        return []
     content = find_content(images, lens, poses, volume, pairs, settings, workers)
     shrinkage = settings.shrinkage(lens)
     images = [before_shrinking(image, shrinkage) for image in images]

@@ -120,9 +120,9 @@ def _solve_start(
     start: MarkerSolution | None = None,
 ) -> MarkerSolution:
     picked = agreeing_poses(seen, two_poses(seen.corners_px, lens, edge_mm))
-    poses, squares = _placed(start, marker_ids) if start else ({}, _most_seen(seen))
+    poses, squares = _placed(start, marker_ids) if start else ({}, _most_seen(seen, picked))
     lost = _chain(seen, picked, poses, squares)
-    seen = seen.of(np.isin(seen.photo, list(poses)))
+    seen = seen.of(np.isin(seen.photo, list(poses)) & np.isin(seen.marker, list(squares)))
     photos, markers = tuple(sorted(poses)), tuple(sorted(squares))
     inner = _reindexed(seen, photos, markers)
     world = tuple(squares[m] for m in markers)
@@ -190,9 +190,15 @@ def _reindexed(seen: Observations, photos: tuple[int, ...], markers: tuple[int, 
     )
 
 
-def _most_seen(seen: Observations) -> dict[int, Pose]:
-    """The marker seen most, at the origin."""
-    return {int(np.bincount(seen.marker).argmax()): Pose(np.eye(3), np.zeros(3))}
+def _most_seen(seen: Observations, picked: list[Pose | None]) -> dict[int, Pose]:
+    """The marker that has a pose in most photos, at the origin. Raises MarkerGeometryError where none has."""
+    posed = seen.marker[[pose is not None for pose in picked]]
+    if not posed.size:
+        raise MarkerGeometryError(
+            "No marker shows as a square in any photo: the corners of each lie on a line.",
+            advice="Photograph from 30 to 60 degrees above the markers' plane, near enough that their bits show.",
+        )
+    return {int(np.bincount(posed).argmax()): Pose(np.eye(3), np.zeros(3))}
 
 
 def _placed(solution: MarkerSolution, marker_ids: tuple[int, ...]) -> tuple[dict[int, Pose], dict[int, Pose]]:

@@ -13,13 +13,16 @@ REFERENCES = 8
 
 
 def two_poses(corners_px: Floats, lens: Intrinsics, edge_mm: float) -> list[list[tuple[Pose, float]]]:
-    """The two poses ``cam_from_marker`` of each square with corners (M, 4, 2), with their RMS in pixels, best first."""
+    """The two poses ``cam_from_marker`` of each square with corners (M, 4, 2), with their RMS in pixels, best first;
+    none of one whose corners lie on a line."""
     square, found = square_corners(edge_mm), []
     for corners in corners_px:
         _, rvecs, tvecs, errors = cv2.solvePnPGeneric(
             square, corners.reshape(4, 1, 2), lens.matrix, lens.distortion, flags=cv2.SOLVEPNP_IPPE_SQUARE
         )
-        found.append([(r.ravel(), t.ravel(), float(e)) for r, t, e in zip(rvecs, tvecs, errors.ravel(), strict=True)])
+        # Four corners on a line or in a point have no pose, for which OpenCV gives None.
+        answers = () if errors is None else zip(rvecs, tvecs, errors.ravel(), strict=True)
+        found.append([(r.ravel(), t.ravel(), float(e)) for r, t, e in answers])
     turns = iter(rotation_from_vector(np.array([r for poses in found for r, _, _ in poses]).reshape(-1, 3)))
     options = [[(Pose(next(turns), t), e) for _, t, e in poses] for poses in found]
     finite = [[(p, e) for p, e in poses if np.isfinite(p.R).all() and np.isfinite(p.t).all()] for poses in options]
