@@ -125,6 +125,12 @@ class CubeNotFoundError(SpecimapError, FileNotFoundError):
     code = "cube_not_found"
 
 
+class CubeNotReadableError(SpecimapError, PermissionError):
+    """The cube, or the data beside its header, may not be read by this user; details hold the path."""
+
+    code = "cube_not_readable"
+
+
 class CubeFormatError(SpecimapError, ValueError):
     """The file is of no known cube format, or holds no cube."""
 
@@ -219,6 +225,7 @@ HTTP_STATUS: dict[type[SpecimapError], int] = {
     CubeFormatError: 415,
     CubeHeaderError: 422,
     CubeNotFoundError: 404,
+    CubeNotReadableError: 403,
     CubeTruncatedError: 422,
     DepthNotFoundError: 422,
     DuplicateMarkersError: 422,
