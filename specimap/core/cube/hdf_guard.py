@@ -29,7 +29,9 @@ def open_guarded(path: Path, **options: Any) -> h5py.File:
     file = h5py.File(path, "r", **options)
     try:
         _check_links(path, file)
-        file.visititems(lambda name, node: _check_storage(path, node))
+        outside = file.visititems(lambda name, node: name if _stored_outside(node) else None)
+        if outside is not None:
+            raise _leads_out(path, outside)
     except BaseException:
         file.close()
         raise
@@ -39,9 +41,8 @@ def open_guarded(path: Path, **options: Any) -> h5py.File:
 def guarded_dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
     """The data set ``name``, whose values may be read. Raises CubeFormatError where they must not be."""
     node = file[name]
-    if not isinstance(node, h5py.Dataset) or node.file != file:
+    if not isinstance(node, h5py.Dataset) or node.file != file or _stored_outside(node):
         raise _leads_out(path, name)
-    _check_storage(path, node)
     creation = node.id.get_create_plist()
     filters = [creation.get_filter(i) for i in range(creation.get_nfilters())]
     foreign = [f for f in filters if f[0] not in _OWN_FILTERS]
@@ -59,28 +60,31 @@ def guarded_dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
 def _check_links(path: Path, file: h5py.File) -> None:
     count = 0
 
-    def visit(name: str, link: object) -> None:  # neither soft nor external links are followed
+    # It stops at the first name that is returned; an error raised in it would not come through h5py whole.
+    def suspicious(name: str, link: object) -> str | None:
         nonlocal count
         count += 1
-        if count > _MOST_LINKS:
-            raise CubeFormatError(
-                f"{path.name} holds more than {_MOST_LINKS} objects.", advice="Save the cube in a file of its own."
-            )
-        if not isinstance(link, h5py.HardLink | h5py.SoftLink):
-            raise _leads_out(path, name)
+        inside = isinstance(link, h5py.HardLink | h5py.SoftLink)
+        return None if inside and count <= _MOST_LINKS else name
 
     try:
-        file.visititems_links(visit)
+        found = file.visititems_links(suspicious)  # follows neither soft nor external links
     except TypeError as error:  # h5py's word for a link of a user-defined class
         raise _leads_out(path, "?") from error
+    if count > _MOST_LINKS:
+        raise CubeFormatError(
+            f"{path.name} holds more than {_MOST_LINKS} objects.", advice="Save the cube in a file of its own."
+        )
+    if found is not None:
+        raise _leads_out(path, found)
 
 
-def _check_storage(path: Path, node: object) -> None:
+def _stored_outside(node: object) -> bool:
     """Its creation properties alone are asked: even the shape of a virtual data set opens the files behind it."""
-    if isinstance(node, h5py.Dataset):
-        creation = node.id.get_create_plist()
-        if creation.get_layout() == h5py.h5d.VIRTUAL or creation.get_external_count():
-            raise _leads_out(path, str(node.name).lstrip("/"))
+    if not isinstance(node, h5py.Dataset):
+        return False
+    creation = node.id.get_create_plist()
+    return bool(creation.get_layout() == h5py.h5d.VIRTUAL or creation.get_external_count())
 
 
 def _leads_out(path: Path, name: str) -> CubeFormatError:
