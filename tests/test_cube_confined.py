@@ -285,8 +285,9 @@ def test_envi_header_names_nothing_outside_its_folder(tmp_path: Path, secret: Pa
     folder = tmp_path / "in"
     folder.mkdir()
     values = np.resize(SECRET, SHAPE)
-    for extra in ({"data_file": str(secret / "raw")}, {"data_file": "../secret/raw"}, {"file_name": "../secret/raw"}):
-        path = write_envi(folder / "x.hdr", values, **extra)
+    for line in (f"data file = {secret / 'raw'}", "data file = ../secret/raw", "file name = ../secret/raw"):
+        path = write_envi(folder / "x.hdr", values)
+        path.write_text(f"{path.read_text()}{line}\n")
         path.with_suffix(".raw").unlink()
         assert check_nothing_leaks(path) is not None
 
@@ -313,7 +314,8 @@ def test_npz_and_matlab_names_are_no_paths(tmp_path: Path, secret: Path) -> None
     np.save(secret / "cube.npy", np.resize(SECRET, SHAPE))
     folder = tmp_path / "in"
     folder.mkdir()
-    np.savez(folder / "x.npz", **{"../secret/cube": VALUES, str(secret / "wavelengths"): NM})
+    arrays: dict[str, Any] = {"../secret/cube": VALUES, str(secret / "wavelengths"): NM}
+    np.savez(folder / "x.npz", **arrays)
     assert check_nothing_leaks(folder / "x.npz") is None
     scipy_io.savemat(folder / "x.mat", {"cube": VALUES, "wavelengths": NM, "file": str(secret / "cube.npy")})
     assert check_nothing_leaks(folder / "x.mat") is None

@@ -132,7 +132,11 @@ class CubeNotReadableError(SpecimapError, PermissionError):
 
 
 class CubeFormatError(SpecimapError, ValueError):
-    """The file is of no known cube format, or holds no cube."""
+    """The file is of no known cube format, or holds no cube.
+
+    So are files with a compression that is not supported, with values in other files, and with several arrays of
+    which nothing tells the cube.
+    """
 
     code = "cube_format_unknown"
 

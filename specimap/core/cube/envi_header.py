@@ -74,10 +74,12 @@ def read_header(path: Path) -> EnviHeader:
 
 
 def is_envi_header(path: Path) -> bool:
-    """Whether the file begins as an ENVI header does."""
+    """Whether the file begins as an ENVI header does. Raises PermissionError where it may not be read."""
     try:
         with open(path, "rb") as f:
             return decoded(f.read(32)).lstrip().startswith(MAGIC)
+    except PermissionError:
+        raise
     except OSError:
         return False
 

@@ -6,7 +6,7 @@ Whatever is read of a file passes :mod:`specimap.core.cube.hdf_guard`, for a str
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import h5py
@@ -72,10 +72,10 @@ def _variables(file: h5py.File) -> list[Variable]:
     found: list[Variable] = []
 
     def visit(name: str, node: object) -> None:  # visititems follows hard links alone
-        if isinstance(node, h5py.Dataset) and node.shape is not None:
+        if isinstance(node, h5py.Dataset) and node.shape is not None and (dtype := _dtype(node)) is not None:
             axes = tuple(_axis_name(node, i) for i in range(len(node.shape)))
             units = _text(node.attrs.get("units", node.attrs.get("Units")))
-            found.append(Variable(name, tuple(node.shape), node.dtype, axes, units, _content(name, node)))
+            found.append(Variable(name, tuple(node.shape), dtype, axes, units, _content(name, node)))
 
     file.visititems(visit)
     return found
@@ -101,7 +101,7 @@ def _wavelengths(
     while True:
         lists = {}
         told = []
-        for name, value in node.attrs.items():
+        for name, value in _attributes(node):
             array = np.asarray(value)
             if array.dtype.kind in "iuf" and array.size > 1:
                 lists[name] = Variable(name, array.shape, array.dtype), array
@@ -113,6 +113,24 @@ def _wavelengths(
         if node.name == "/":
             return None, None
         node = node.parent
+
+
+def _attributes(node: h5py.Dataset | h5py.Group) -> Iterator[tuple[str, object]]:
+    """Names and values of the attributes, without those of a type that NumPy has nothing like."""
+    for name in node.attrs:
+        try:
+            yield name, node.attrs[name]
+        except (TypeError, OSError):
+            continue
+
+
+def _dtype(node: h5py.Dataset) -> np.dtype | None:
+    """The type of its values; None for one that NumPy has nothing like (HDF5's times and bit fields)."""
+    try:
+        dtype: np.dtype = node.dtype
+    except TypeError:
+        return None
+    return dtype
 
 
 def _axis_name(node: h5py.Dataset, axis: int) -> str:

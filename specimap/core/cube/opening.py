@@ -116,9 +116,8 @@ def _check_file(path: Path) -> None:
 
 
 def _not_readable(path: Path) -> CubeNotReadableError:
-    what = "the folder" if path.is_dir() else "the file"
     return CubeNotReadableError(
         f"{path} cannot be read: no permission.",
-        advice=f"Give your user permission to read {what}, or copy the cube to a folder of your own.",
+        advice="Give your user permission to read it and its folder, or copy the cube to a folder of your own.",
         path=str(path),
     )
