@@ -254,6 +254,20 @@ def test_units_in_names(tmp_path: Path, name: str, factor: float) -> None:
     np.testing.assert_allclose(open_cube(tmp_path / "x.h5").wavelengths_nm, NM)
 
 
+@pytest.mark.parametrize(
+    ("name", "unit", "values"),
+    [("bands", "nm", NM), ("photon_energy_eV", None, 1239.841984 / NM), ("spectral_axis", "THz", 299792.458 / NM)],
+)
+def test_vectors_whose_unit_makes_them_wavelengths(tmp_path: Path, name: str, unit: str | None, values: Any) -> None:
+    for units, right in ((unit, NM), ("1", np.full(16, np.nan))):
+        with h5py.File(tmp_path / "x.h5", "w") as f:
+            f["cube"] = VALUES
+            f[name] = values
+            if units:
+                f[name].attrs["units"] = units
+        np.testing.assert_allclose(open_cube(tmp_path / "x.h5").wavelengths_nm, right)
+
+
 def test_ome_channels_name_wavelengths(tmp_path: Path) -> None:
     pages = np.ascontiguousarray(VALUES.transpose(2, 0, 1))
     channel = {"EmissionWavelength": list(map(float, NM)), "EmissionWavelengthUnit": ["nm"] * 16}

@@ -28,6 +28,8 @@ _WAVELENGTH_NAME = re.compile(
     r"wave|lambda|frequenc|(^|[^a-z])(wls?|wvls?|wn|freqs?)([^a-z]|$)|band_?cent|cent(er|re)s?_?of_?band",
     re.IGNORECASE,
 )
+# Names of vectors that are wavelengths where their unit is one of the spectrum's.
+_SPECTRAL_NAME = re.compile(r"band|channel|energ|spectr|axis|(^|[^a-z])cw", re.IGNORECASE)
 _NO_WAVELENGTH = re.compile(r"fwhm|width|uncert|err|std|flag|good|mask|resol|count|unit|range|index", re.IGNORECASE)
 _BAND_AXIS_NAME = re.compile(r"wave|band|lambda|spectr|channel|freq|(^|_)wl($|_)", re.IGNORECASE)
 _ACROSS_NAME = re.compile(r"x|cols?|columns?|samples?|lon(gitude)?|width|easting|across.*|pixels?", re.IGNORECASE)
@@ -167,12 +169,19 @@ def choose_wavelengths(variables: Sequence[Variable], cube: Variable) -> Variabl
 
 
 def _spectral_vectors(variables: Sequence[Variable]) -> list[Variable]:
-    return [
+    vectors = [
         v
         for v in variables
         if v.shape and 1 <= math.prod(v.shape) == max(v.shape) <= _MOST_WAVELENGTHS and readable_dtype(v.dtype)
-        and _WAVELENGTH_NAME.search(v.short_name) and not _NO_WAVELENGTH.search(v.short_name)
+        and not _NO_WAVELENGTH.search(v.short_name)
     ]  # fmt: skip
+    named = [v for v in vectors if _WAVELENGTH_NAME.search(v.short_name)]
+    return named or [v for v in vectors if _SPECTRAL_NAME.search(v.short_name) and _has_spectral_unit(v)]
+
+
+def _has_spectral_unit(variable: Variable) -> bool:
+    unit = variable.units if variable.units is not None else _units_in_name(variable.short_name)
+    return read_unit(unit).kind in ("length", "wavenumber", "frequency", "energy")
 
 
 def _group(variable: Variable) -> str:

@@ -25,6 +25,8 @@ from specimap.core.geometry import Array, Floats
 _LARGEST_CHUNK_ROW = 512 << 20
 _TRUNCATED = re.compile(r"truncated file: eof = (\d+).*stored_eof = (\d+)")
 _LONGEST_UNITS = 64
+# The label of a dimension scale that stands for an axis without coordinates.
+_NETCDF_NO_NAME = "This is a netCDF dimension"
 _SCALE_NAMES = ("reflectance scale factor", "reflectance_scale_factor", "scale_factor")
 
 
@@ -138,7 +140,10 @@ def _axis_name(node: h5py.Dataset, axis: int) -> str:
     try:
         if node.dims[axis].label:
             return str(node.dims[axis].label)
-        return str(node.dims[axis].keys()[0] or node.dims[axis][0].name).rpartition("/")[2]
+        label = str(node.dims[axis].keys()[0])
+        if not label or label.startswith(_NETCDF_NO_NAME):
+            label = str(node.dims[axis][0].name)
+        return label.rpartition("/")[2]
     except (IndexError, RuntimeError):
         return ""
 
