@@ -222,6 +222,22 @@ def test_pipes_folders_sockets_and_lost_links(tmp_path: Path) -> None:
             open_cube(tmp_path / name)
 
 
+def test_paths_that_no_file_can_have(tmp_path: Path) -> None:
+    for name in ("x" * 3000, "a\0b", "x.npy/y.npy", "x::y"):
+        with pytest.raises(CubeNotFoundError):
+            open_cube(tmp_path / name)
+    for name in ("::", "::cube"):
+        with pytest.raises(CubeFormatError, match="folder"):
+            open_cube(tmp_path / name)
+
+
+def test_a_picture_beside_a_header_is_not_its_data(tmp_path: Path) -> None:
+    write_envi(tmp_path / "x.hdr", VALUES)
+    (tmp_path / "x.png").write_bytes(bytes(2 * VALUES.nbytes))
+    with pytest.raises(CubeFormatError, match="no known cube format"):
+        open_cube(tmp_path / "x.png")
+
+
 @pytest.mark.parametrize("companion", ["fifo", "folder", "lost link"])
 def test_companions_that_are_no_files(tmp_path: Path, companion: str) -> None:
     path = write_envi(tmp_path / "x.hdr", VALUES)

@@ -89,6 +89,8 @@ def _among(siblings: dict[str, list[Path]], name: str) -> Path | None:
 
 def _find_header(data_path: Path) -> Path | None:
     """``x.bil.hdr``, else ``x.hdr``, for the data file ``x.bil``; only one that is an ENVI header."""
+    if data_path.suffix.lower() in _OTHER_SUFFIXES:
+        return None
     siblings = _siblings(data_path)
     for name in (data_path.name + _HEADER_SUFFIX, data_path.stem + _HEADER_SUFFIX):
         header = _among(siblings, name)

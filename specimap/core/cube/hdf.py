@@ -24,6 +24,7 @@ from specimap.core.geometry import Array, Floats
 # A larger row of chunks is not kept decoded while it is read by rows: the cube is unpacked once instead.
 _LARGEST_CHUNK_ROW = 512 << 20
 _TRUNCATED = re.compile(r"truncated file: eof = (\d+).*stored_eof = (\d+)")
+_UNIT_ATTRIBUTES = ("units", "unit", "wavelength_units")
 _LONGEST_UNITS = 64
 # The label of a dimension scale that stands for an axis without coordinates.
 _NETCDF_NO_NAME = "This is a netCDF dimension"
@@ -76,7 +77,7 @@ def _variables(file: h5py.File) -> list[Variable]:
     def visit(name: str, node: object) -> None:  # visititems follows hard links alone
         if isinstance(node, h5py.Dataset) and node.shape is not None and (dtype := _dtype(node)) is not None:
             axes = tuple(_axis_name(node, i) for i in range(len(node.shape)))
-            units = _text(node.attrs.get("units", node.attrs.get("Units")))
+            units = next((_text(node.attrs[key]) for key in node.attrs if key.lower() in _UNIT_ATTRIBUTES), None)
             found.append(Variable(name, tuple(node.shape), dtype, axes, units, _content(name, node)))
 
     file.visititems(visit)

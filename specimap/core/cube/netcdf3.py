@@ -50,7 +50,8 @@ class NetCdf3Format:
 
 
 def _units(variable: object) -> str | None:
-    units = getattr(variable, "units", None)
+    told = {name.lower(): value for name, value in vars(variable).items()}
+    units = told.get("units", told.get("unit"))
     return units.decode("utf-8", "replace") if isinstance(units, bytes) else None
 
 

@@ -78,7 +78,7 @@ def _open(given: Path) -> tuple[Cube, str | None]:
                 return cube_format.open(path, dataset), dataset
     except SpecimapError:
         raise
-    except PermissionError as error:
+    except PermissionError as error:  # from the file's own folder, or from the data beside a header
         raise _not_readable(Path(error.filename) if isinstance(error.filename, str) else path) from error
     except Exception as error:
         # Not a list of types: on damaged files the libraries raise anything, ZeroDivisionError included.
@@ -98,7 +98,15 @@ def _open(given: Path) -> tuple[Cube, str | None]:
 
 def _check_file(path: Path) -> None:
     """What can be said before the content is looked at."""
-    if not path.exists():
+    try:
+        there = path.exists()
+    except PermissionError:
+        raise
+    except OSError as error:
+        raise CubeNotFoundError(
+            f"{path} cannot be reached: {error.strerror}.", advice="Check the path and the disk.", path=str(path)
+        ) from error
+    if not there:
         lost = path.is_symlink()
         raise CubeNotFoundError(
             f"{path} {'is a link to a file that does not exist' if lost else 'does not exist'}.",
