@@ -304,3 +304,24 @@ def test_hdf5_with_types_that_numpy_does_not_know(tmp_path: Path) -> None:
         f["words"] = ["a", "b"]
         f["empty"] = h5py.Empty("f8")
     check_reads(open_cube(path), COUNTS)
+
+
+def test_names_from_a_file_move_no_cursor(tmp_path: Path) -> None:
+    bad = "a\x1b[31m\n" + "b" * 5000
+    path = hdf5(tmp_path, {bad: COUNTS, "two": COUNTS, "wavelengths": NM})
+    with pytest.raises(CubeFormatError) as caught:
+        open_cube(path)
+    words = str(caught.value) + repr(caught.value.details)
+    with h5py.File(path, "r+") as f:
+        f["reflectance"] = COUNTS
+        f["wavelengths"].attrs["units"] = bad
+    words += repr(open_cube(path).warnings)
+    header = write_envi(tmp_path / "x.hdr", COUNTS)
+    for line in (f"interleave = {bad[:6]}", f"data type = {bad[:6]}", f"wavelength = {{{bad[:6]}}}"):
+        header.write_text(f"{header.read_text()}{line}\n")
+        with pytest.raises(CubeHeaderError) as wrong:
+            open_cube(header)
+        words += str(wrong.value)
+    assert "\x1b" not in words
+    assert "\\x1b" not in words
+    assert len(words) < 6000

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from specimap.core.cube.model import readable_dtype
+from specimap.core.cube.shown import shown
 from specimap.core.cube.spectral_units import read_unit
 from specimap.core.cube.wavelengths import Warnings
 from specimap.core.errors import CubeFormatError, CubeHeaderError
@@ -58,12 +59,12 @@ class Variable:
         """The name without the groups above it."""
         return self.name.rpartition("/")[2]
 
-    def shown(self) -> str:
+    def described(self) -> str:
         """Name and shape, with the axes' names where they have some: ``'L1/data' (y 512, x 640, band 61)``."""
         named = len(self.axes) == len(self.shape) and any(self.axes)
         axes = self.axes if named else ("",) * len(self.shape)
-        sides = [f"{axis} {side}".strip() for axis, side in zip(axes, self.shape, strict=True)]
-        return f"'{self.name}' ({', '.join(sides)})"
+        sides = [f"{shown(axis)} {side}".strip() for axis, side in zip(axes, self.shape, strict=True)]
+        return f"'{shown(self.name)}' ({', '.join(sides[:_SHOWN])}{', ...' if len(sides) > _SHOWN else ''})"
 
 
 def choose_cube(path: Path, variables: Sequence[Variable], wanted: str | None = None) -> tuple[Variable, Warnings]:
@@ -87,9 +88,10 @@ def choose_cube(path: Path, variables: Sequence[Variable], wanted: str | None = 
     chosen = _preferred(found, variables)
     if chosen is None:
         raise _refusal(path, "several arrays with three axes", found)
-    others = ", ".join(v.shown() for v in found if v is not chosen)
-    text = f"{path.name} holds several arrays that could be the cube. {chosen.shown()} was taken, not {others}."
-    return chosen, (("dataset_chosen", f"{text} --cube FILE::DATASET takes another."),)
+    beside = [v.described() for v in found if v is not chosen]
+    others = ", ".join(beside[:_SHOWN]) + (", ..." if len(beside) > _SHOWN else "")
+    text = f"{path.name} holds several arrays that could be the cube. {chosen.described()} was taken, not {others}."
+    return chosen, (("dataset_chosen", f"{text} On the command line --cube FILE::DATASET takes another."),)
 
 
 def _wanted(path: Path, variables: Sequence[Variable], wanted: str) -> Variable:
@@ -100,12 +102,13 @@ def _wanted(path: Path, variables: Sequence[Variable], wanted: str) -> Variable:
         or [v for v in variables if v.short_name.lower() == name.lower()]
     )
     if len(named) != 1:
-        raise _refusal(path, f"{'several arrays' if named else 'no array'} called '{wanted}'", named or variables)
+        what = "several arrays" if named else "no array"
+        raise _refusal(path, f"{what} called '{shown(wanted)}'", named or variables)
     chosen = named[0]
     if not readable_dtype(chosen.dtype):
         raise _wrong_type(path, chosen)
     if len(chosen.shape) != 3 or 0 in chosen.shape:
-        raise _refusal(path, f"{chosen.shown()}, which has not three axes,", variables)
+        raise _refusal(path, f"{chosen.described()}, which has not three axes,", variables)
     return chosen
 
 
@@ -128,22 +131,22 @@ def _preferred(found: Sequence[Variable], variables: Sequence[Variable]) -> Vari
 
 def _wrong_type(path: Path, variable: Variable) -> CubeHeaderError:
     return CubeHeaderError(
-        f"'{variable.name}' in {path.name} holds values of type {variable.dtype}.",
+        f"'{shown(variable.name)}' in {path.name} holds values of type {shown(str(variable.dtype))}.",
         advice="Save the cube as integers or real floating-point numbers.",
-        field="dtype", value=str(variable.dtype),
+        field="dtype", value=shown(str(variable.dtype)),
     )  # fmt: skip
 
 
 def _refusal(path: Path, what: str, variables: Sequence[Variable]) -> CubeFormatError:
     arrays = [v for v in variables if v.text is None]
-    shown = ", ".join(v.shown() for v in arrays[:_SHOWN]) + (", ..." if len(arrays) > _SHOWN else "")
+    listed = ", ".join(v.described() for v in arrays[:_SHOWN]) + (", ..." if len(arrays) > _SHOWN else "")
     several = "Name the one that is the cube: --cube FILE::DATASET; or save it alone."
     alone = "Save one array of rows x columns x bands, named 'cube'."
     return CubeFormatError(
-        f"{path.name} holds {what}{f': {shown}' if shown else ''}.",
+        f"{path.name} holds {what}{f': {listed}' if listed else ''}.",
         advice=several if sum(len(v.shape) == 3 for v in arrays) > 1 else alone,
-        variables=[v.name for v in arrays[:20]],
-        shapes=[list(v.shape) for v in arrays[:20]],
+        variables=[shown(v.name) for v in arrays[:20]],
+        shapes=[list(v.shape[:_SHOWN]) for v in arrays[:20]],
     )
 
 
@@ -227,11 +230,11 @@ def cube_axes(
     elif len(fitting) == 1:
         band = fitting[0]
         if len(named) == 1:
-            text = f"The axes' names of {cube.shown()} do not fit its {count} wavelengths; axis {band} is the bands'."
-            warnings = (("axes_assumed", text),)
+            text = f"The axes' names of {cube.described()} do not fit its {count} wavelengths"
+            warnings = (("axes_assumed", f"{text}; number {band} is taken as the bands'."),)
     else:
         band = usual if usual in fitting or not fitting else fitting[-1]
-        text = f"Nothing tells which axis of '{cube.name}' {cube.shape} is the bands'; number {band} it is."
+        text = f"Nothing tells which axis of '{shown(cube.name)}' {cube.shape} is the bands'; number {band} it is."
         warnings = (("axes_assumed", text),)
     row, col = (i for i in range(3) if i != band)
     swapped = reversed_axes

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from specimap.core.cube.shown import shown
 from specimap.core.cube.spectral_units import read_unit
 from specimap.core.cube.wavelengths import Warnings
 from specimap.core.errors import CubeHeaderError
@@ -22,7 +23,6 @@ from specimap.core.geometry import Floats
 
 MAGIC = "ENVI"
 _LARGEST_HEADER = 32 << 20
-_SHOWN = 60
 _LARGEST_SIDE = 2**31 - 1
 _LARGEST_CUBE_BYTES = 2**50
 _WHOLE_NUMBER = re.compile(r"[+-]?[0-9]{1,18}")
@@ -128,7 +128,7 @@ def parse_fields(name: str, text: str) -> dict[str, str]:
                 following = next(lines, None)
                 if following is None:
                     raise CubeHeaderError(
-                        f"{name}: the list of '{key}' is not closed; the header is cut short.",
+                        f"{name}: the list of '{shown(key)}' is not closed; the header is cut short.",
                         advice="Copy the header again from where it was recorded.",
                         field=key,
                     )
@@ -137,7 +137,7 @@ def parse_fields(name: str, text: str) -> dict[str, str]:
             value = "\n".join(parts).rpartition("}")[0].strip()
         if key in _TOLD_ONCE and key in fields and not _same(fields[key], value):
             raise CubeHeaderError(
-                f"{name} gives '{key}' twice, as {_short(fields[key])!r} and {_short(value)!r}.",
+                f"{name} gives '{key}' twice, as {shown(fields[key])!r} and {shown(value)!r}.",
                 advice="Keep the right one of the two lines.",
                 field=key,
             )
@@ -158,10 +158,6 @@ def _same(one: str, other: str) -> bool:
         return found
 
     return one == other or parts(one) == parts(other)
-
-
-def _short(value: str) -> str:
-    return value if len(value) <= _SHOWN else value[: _SHOWN - 3] + "..."
 
 
 class _Reader:
@@ -200,11 +196,11 @@ class _Reader:
 
     def _wrong(self, field: str, why: str) -> CubeHeaderError:
         value = self._fields.get(field, "")
-        shown = _short(value)
+        told = shown(value)
         return CubeHeaderError(
-            f"{self._name}: '{field} = {shown}' {why}.",
+            f"{self._name}: '{field} = {told}' {why}.",
             advice=f"Correct '{field}' in the header, or export the cube again.",
-            field=field, value=shown,
+            field=field, value=told,
         )  # fmt: skip
 
     def _required(self, field: str) -> str:

@@ -14,6 +14,7 @@ from specimap.core.cube.discover import Variable, choose_cube, choose_wavelength
 from specimap.core.cube.model import Cube, check_dtype, describe
 from specimap.core.cube.pixels import ArrayPixels
 from specimap.core.cube.scratch import bytes_of, scratch_array
+from specimap.core.cube.shown import shown
 from specimap.core.cube.wavelengths import Warnings
 from specimap.core.errors import CubeFormatError, CubeTruncatedError
 from specimap.core.geometry import Array, Floats
@@ -38,7 +39,7 @@ def refuse_dataset(path: Path, dataset: str | None) -> None:
     """Raises CubeFormatError where one is named in a file that holds a single array."""
     if dataset is not None:
         raise CubeFormatError(
-            f"{path.name} holds one cube, and no data sets with names such as '{dataset}'.",
+            f"{path.name} holds one cube, and no data sets with names such as '{shown(dataset)}'.",
             advice="Give the file alone, without '::'.",
         )
 

@@ -13,6 +13,7 @@ from specimap.core.cube.matlab5 import Matlab5Format
 from specimap.core.cube.model import Cube, CubeFormat
 from specimap.core.cube.netcdf3 import NetCdf3Format
 from specimap.core.cube.npy import NpyFormat, NpzFormat
+from specimap.core.cube.shown import shown
 from specimap.core.cube.tiff import TiffFormat
 from specimap.core.errors import (
     CubeFormatError,
@@ -83,7 +84,7 @@ def _open(given: Path) -> tuple[Cube, str | None]:
     except Exception as error:
         # Not a list of types: on damaged files the libraries raise anything, ZeroDivisionError included.
         raise CubeFormatError(
-            f"{path.name} cannot be read: {error or type(error).__name__}.",
+            f"{path.name} cannot be read: {shown(str(error), 300) or type(error).__name__}.",
             advice="The file is damaged, incomplete, or not what its name says: copy or export it again.",
             path=str(path),
         ) from error

@@ -7,10 +7,12 @@ import unicodedata
 from dataclasses import dataclass
 from typing import Literal
 
+from specimap.core.cube.shown import shown
 from specimap.core.geometry import Floats
 
 Kind = Literal["length", "wavenumber", "frequency", "energy", "index", "none", "unrecognised"]
 
+_LONGEST = 1000
 _LIGHT_NM_PER_S = 299_792_458e9
 _NM_EV = 1_239.841_984  # Planck's constant times the speed of light
 
@@ -59,7 +61,7 @@ class Unit:
 
 def read_unit(text: str | None) -> Unit:
     """The unit that a file's own words mean: ``Nanometers``, ``um``, ``Wavenumbers (cm-1)``, ``GHz``, ``Index``."""
-    word = " ".join((text or "").split()).strip("\0 ")
+    word = shown(" ".join((text or "")[:_LONGEST].replace("\0", " ").split()))
     plain = unicodedata.normalize("NFKC", word).replace("\N{MINUS SIGN}", "-").replace("\N{GREEK SMALL LETTER MU}", "u")
     plain = plain.replace("\N{LATIN CAPITAL LETTER A WITH RING ABOVE}", "A").lower()
     plain = unicodedata.normalize("NFKD", plain).encode("ascii", "ignore").decode()
