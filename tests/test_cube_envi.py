@@ -66,11 +66,11 @@ def test_envi_defaults_and_comments(tmp_path: Path) -> None:
     dropped = ("byte order", "header offset", "file type")
     path = write_envi(tmp_path / "x.hdr", values, "bil", drop=dropped)
     text = path.read_text().replace("ENVI\n", "ENVI\n; bands = 99\n")
-    path.write_text(text + "wavelength = {\n1,2,3,\n; 400 = not a wavelength }\n4,5,6,7,8,9,10,11 }\n")
+    path.write_text(text + "wavelength = {\n1.5,2.5,3.5,\n; 400 = not a wavelength }\n4,5,6,7,8,9,10,11 }\n")
     cube = open_cube(path)
     check_reads(cube, values)
     assert dict(cube.warnings).keys() == {"byte_order_assumed"}
-    np.testing.assert_allclose(cube.wavelengths_nm, np.arange(1, 12) * 1e3)
+    np.testing.assert_allclose(cube.wavelengths_nm, np.array([1.5, 2.5, 3.5, *range(4, 12)]) * 1e3)
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,12 @@ class Kind(StrEnum):
 @app.command()
 def run(
     photos: Annotated[Path, typer.Option(help="Folder of the photos (JPEG, PNG, TIFF, HEIC).")],
-    cube: Annotated[Path, typer.Option(help="The cube: an ENVI header, .npy, .npz, HDF5, NetCDF, MATLAB or TIFF.")],
+    cube: Annotated[
+        Path,
+        typer.Option(
+            help="The cube: an ENVI header, .npy, .npz, HDF5, NetCDF, MATLAB or TIFF; FILE::DATASET for one of several."
+        ),
+    ],
     out: Annotated[Path, typer.Option(help="Folder for the results; an earlier run's is continued.")],
     white: Annotated[Path | None, typer.Option(help="White reference of the cube, for reflectance.")] = None,
     dark: Annotated[Path | None, typer.Option(help="Dark reference of the cube.")] = None,

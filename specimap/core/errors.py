@@ -125,8 +125,18 @@ class CubeNotFoundError(SpecimapError, FileNotFoundError):
     code = "cube_not_found"
 
 
+class CubeNotReadableError(SpecimapError, PermissionError):
+    """The cube, or the data beside its header, may not be read by this user; details hold the path."""
+
+    code = "cube_not_readable"
+
+
 class CubeFormatError(SpecimapError, ValueError):
-    """The file is of no known cube format, or holds no cube."""
+    """The file is of no known cube format, or holds no cube.
+
+    So are files with a compression that is not supported, with values in other files, and with several arrays of
+    which nothing tells the cube.
+    """
 
     code = "cube_format_unknown"
 
@@ -231,6 +241,7 @@ HTTP_STATUS: dict[type[SpecimapError], int] = {
     CubeFormatError: 415,
     CubeHeaderError: 422,
     CubeNotFoundError: 404,
+    CubeNotReadableError: 403,
     CubeTruncatedError: 422,
     DepthNotFoundError: 422,
     DuplicateMarkersError: 422,

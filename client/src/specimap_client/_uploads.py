@@ -17,7 +17,7 @@ from specimap_client._tus import GoneError, Tus
 
 AnyPath = str | os.PathLike[str]
 Listener = Callable[[Progress], None]
-_DATA_SUFFIXES = ("", ".raw", ".img", ".dat", ".bil", ".bip", ".bsq", ".bin")
+_DATA_SUFFIXES = ("", ".raw", ".img", ".dat", ".bil", ".bip", ".bsq", ".bin", ".hyspex", ".cube", ".hsi", ".envi")
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import numpy as np
 
 from specimap.core.cube.envi_header import EnviHeader, is_envi_header, read_header
 from specimap.core.cube.model import Cube, describe
+from specimap.core.cube.npy import refuse_dataset
 from specimap.core.cube.pixels import ArrayPixels
 from specimap.core.cube.scratch import bytes_of, scratch_array
 from specimap.core.cube.wavelengths import Warnings
@@ -17,7 +18,13 @@ from specimap.core.errors import CubeHeaderError, CubeNotFoundError, CubeTruncat
 from specimap.core.geometry import Array
 
 _HEADER_SUFFIX = ".hdr"
-_DATA_SUFFIXES = ("", ".raw", ".img", ".dat", ".bil", ".bip", ".bsq", ".bin")
+_DATA_SUFFIXES = ("", ".raw", ".img", ".dat", ".bil", ".bip", ".bsq", ".bin", ".hyspex", ".cube", ".hsi", ".envi")
+# What instruments and programs put beside a cube under its name; none of it is taken for the data.
+_OTHER_SUFFIXES = {
+    ".hdr", ".txt", ".xml", ".json", ".log", ".csv", ".tsv", ".ini", ".md", ".pdf", ".html", ".yaml", ".yml",
+    ".png", ".jpg", ".jpeg", ".bmp", ".gif", ".tif", ".tiff", ".ovr", ".enp", ".sta", ".prj", ".lut", ".roi", ".evf",
+    ".npy", ".npz", ".mat", ".h5", ".hdf5", ".he5", ".nc", ".zip", ".gz", ".bak", ".tmp", ".part",
+}  # fmt: skip
 # From the file's axes to (rows, cols, bands).
 _FILE_SHAPE = {"bip": (0, 1, 2), "bil": (0, 2, 1), "bsq": (2, 0, 1)}
 _TO_CUBE = {"bip": (0, 1, 2), "bil": (0, 2, 1), "bsq": (1, 2, 0)}
@@ -25,7 +32,7 @@ _PIECE = 8 << 20
 
 
 class EnviFormat:
-    """``x.hdr`` with ``x``, ``x.raw``, ``.img``, ``.dat``, ``.bil``, ``.bip``, ``.bsq``; or ``x.bil.hdr``."""
+    """``x.hdr`` with ``x``, ``x.raw``, ``.img``, ``.dat``, ``.bil``, ``.hyspex`` and so on; or ``x.bil.hdr``."""
 
     name = "ENVI"
     suffixes: tuple[str, ...] = (_HEADER_SUFFIX, *_DATA_SUFFIXES)
@@ -34,7 +41,8 @@ class EnviFormat:
         suffix = path.suffix.lower()
         return suffix == _HEADER_SUFFIX or is_envi_header(path) or _find_header(path) is not None
 
-    def open(self, path: Path) -> Cube:
+    def open(self, path: Path, dataset: str | None = None) -> Cube:
+        refuse_dataset(path, dataset)
         if path.suffix.lower() == _HEADER_SUFFIX or is_envi_header(path):
             header_path = path
             header = read_header(header_path)
@@ -81,7 +89,7 @@ def _among(siblings: dict[str, list[Path]], name: str) -> Path | None:
 
 def _find_header(data_path: Path) -> Path | None:
     """``x.bil.hdr``, else ``x.hdr``, for the data file ``x.bil``; only one that is an ENVI header."""
-    if data_path.suffix.lower() not in _DATA_SUFFIXES:
+    if data_path.suffix.lower() in _OTHER_SUFFIXES:
         return None
     siblings = _siblings(data_path)
     for name in (data_path.name + _HEADER_SUFFIX, data_path.stem + _HEADER_SUFFIX):
@@ -92,20 +100,36 @@ def _find_header(data_path: Path) -> Path | None:
 
 
 def _find_data(header_path: Path, header: EnviHeader) -> Path:
-    """The data file by ENVI's rules; of several the first that is long enough."""
+    """The data file by ENVI's rules, or of another suffix; of several the first that is long enough."""
     stem = header_path.name[: -len(_HEADER_SUFFIX)] if header_path.suffix else header_path.name
     siblings = _siblings(header_path)
     suffixes = dict.fromkeys(("", "." + header.interleave, *_DATA_SUFFIXES))
     files = [_among(siblings, stem + suffix) for suffix in suffixes]
     candidates = [p for p in files if p is not None and p != header_path]
+    needed = 0 if header.compressed else header.data_bytes
+    long_enough = next((p for p in candidates if p.stat().st_size >= needed), None)
+    if long_enough is not None:
+        return long_enough
+    # A suffix that nobody has heard of must hold exactly what the header asks for, for it may be anything.
+    exact = [p for p in _of_other_suffixes(siblings, stem) if header.compressed or p.stat().st_size == needed]
+    if len(exact) == 1:
+        return exact[0]
     if not candidates:
         raise CubeNotFoundError(
             f"The data of {header_path.name} are not beside it.",
             advice=f"Put {stem}, {stem}.raw, {stem}.img or {stem}.dat into the header's folder.",
             path=str(header_path),
         )
-    needed = 0 if header.compressed else header.data_bytes
-    return next((p for p in candidates if p.stat().st_size >= needed), candidates[0])
+    return candidates[0]
+
+
+def _of_other_suffixes(siblings: dict[str, list[Path]], stem: str) -> list[Path]:
+    found = [p for name, files in siblings.items() if name.startswith(f"{stem.lower()}.") for p in files]
+    return [
+        p
+        for p in found
+        if "." not in p.name[len(stem) + 1 :] and p.suffix.lower() not in _OTHER_SUFFIXES and p.is_file()
+    ]
 
 
 def _truncated(path: Path, expected: int, found: int) -> CubeTruncatedError:

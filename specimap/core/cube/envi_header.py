@@ -15,11 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
+from specimap.core.cube.shown import shown
+from specimap.core.cube.spectral_units import read_unit
 from specimap.core.cube.wavelengths import Warnings
 from specimap.core.errors import CubeHeaderError
 from specimap.core.geometry import Floats
 
-MAGIC = b"ENVI"
+MAGIC = "ENVI"
 _LARGEST_HEADER = 32 << 20
 _LARGEST_SIDE = 2**31 - 1
 _LARGEST_CUBE_BYTES = 2**50
@@ -30,9 +32,16 @@ _DATA_TYPES = {
 _COMPLEX_TYPES = (6, 9)
 # Kinds of file that carry an ENVI header, but no plain cube of spectra behind it.
 _OTHER_FILE_TYPES = ("classification", "spectral library", "meta", "virtual", "tiff", "jpeg", "nitf", "hdf")
-_LAYOUT_FIELDS = (
+# Two lines of one of these that differ leave open what the data mean.
+_TOLD_ONCE = (
     "samples", "lines", "bands", "data type", "interleave", "byte order", "header offset", "file compression",
+    "wavelength", "wavelength units", "bbl", "reflectance scale factor", "data ignore value", "data gain values",
+    "data offset values",
 )  # fmt: skip
+# A byte-order mark, or the first letters of a header in UTF-16 without one.
+_UTF16 = {
+    b"\xff\xfe": "utf-16-le", b"\xfe\xff": "utf-16-be", b"E\0N\0": "utf-16-le", b"\0E\0N": "utf-16-be",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -65,38 +74,49 @@ def read_header(path: Path) -> EnviHeader:
 
 
 def is_envi_header(path: Path) -> bool:
-    """Whether the file begins as an ENVI header does."""
+    """Whether the file begins as an ENVI header does. Raises PermissionError where it may not be read."""
     try:
         with open(path, "rb") as f:
-            return f.read(16).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(MAGIC)
+            return decoded(f.read(32)).lstrip().startswith(MAGIC)
+    except PermissionError:
+        raise
     except OSError:
         return False
 
 
-def _text(path: Path) -> str:
-    if not is_envi_header(path):
-        raise CubeHeaderError(
-            f"{path.name} is not an ENVI header: it does not begin with the word ENVI.",
-            advice="Give the header that ENVI or the camera's software wrote beside the cube.",
-            field="ENVI",
-        )
-    if path.stat().st_size > _LARGEST_HEADER:
-        raise CubeHeaderError(
-            f"{path.name} is too large for a header.",
-            advice="Give the text header of the cube.",
-            field="ENVI",
-        )
-    raw = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
+def decoded(raw: bytes) -> str:
+    """The text of a header, in UTF-16 or UTF-8 with or without a byte-order mark, or in Latin-1."""
+    for start, encoding in _UTF16.items():
+        if raw.startswith(start):
+            return raw.decode(encoding, "replace").removeprefix("\ufeff")
+    raw = raw.removeprefix(b"\xef\xbb\xbf")
     try:
         return raw.decode("utf-8")
     except UnicodeDecodeError:
         return raw.decode("latin-1")
 
 
+def _text(path: Path) -> str:
+    if path.stat().st_size > _LARGEST_HEADER:
+        raise CubeHeaderError(
+            f"{path.name} is too large for a header.",
+            advice="Give the text header of the cube.",
+            field="ENVI",
+        )
+    text = decoded(path.read_bytes())
+    if not text.lstrip().startswith(MAGIC):
+        raise CubeHeaderError(
+            f"{path.name} is not an ENVI header: it does not begin with the word ENVI.",
+            advice="Give the header that ENVI or the camera's software wrote beside the cube.",
+            field="ENVI",
+        )
+    return text
+
+
 def parse_fields(name: str, text: str) -> dict[str, str]:
     """Fields by lower-case name; values in braces without them. Lines that begin with ``;`` are comments."""
     fields: dict[str, str] = {}
-    lines = iter(text.splitlines()[1:])
+    lines = iter(text.lstrip().splitlines()[1:])
     for line in lines:
         key, equals, value = line.partition("=")
         if not equals or line.lstrip().startswith(";"):
@@ -108,21 +128,36 @@ def parse_fields(name: str, text: str) -> dict[str, str]:
                 following = next(lines, None)
                 if following is None:
                     raise CubeHeaderError(
-                        f"{name}: the list of '{key}' is not closed; the header is cut short.",
+                        f"{name}: the list of '{shown(key)}' is not closed; the header is cut short.",
                         advice="Copy the header again from where it was recorded.",
                         field=key,
                     )
                 if not following.lstrip().startswith(";"):
                     parts.append(following)
             value = "\n".join(parts).rpartition("}")[0].strip()
-        if key in _LAYOUT_FIELDS and fields.get(key, value) != value:
+        if key in _TOLD_ONCE and key in fields and not _same(fields[key], value):
             raise CubeHeaderError(
-                f"{name} gives '{key}' twice, as {fields[key]!r} and {value!r}.",
+                f"{name} gives '{key}' twice, as {shown(fields[key])!r} and {shown(value)!r}.",
                 advice="Keep the right one of the two lines.",
                 field=key,
             )
         fields[key] = value
     return fields
+
+
+def _same(one: str, other: str) -> bool:
+    """Whether two values differ in nothing but case, spaces and the way in which numbers are written."""
+
+    def parts(value: str) -> list[str | float]:
+        found: list[str | float] = []
+        for word in re.split(r"[\s,]+", value.strip().lower()):
+            try:
+                found.append(float(word))
+            except ValueError:
+                found.append(word)
+        return found
+
+    return one == other or parts(one) == parts(other)
 
 
 class _Reader:
@@ -161,11 +196,11 @@ class _Reader:
 
     def _wrong(self, field: str, why: str) -> CubeHeaderError:
         value = self._fields.get(field, "")
-        shown = value if len(value) <= 60 else value[:57] + "..."
+        told = shown(value)
         return CubeHeaderError(
-            f"{self._name}: '{field} = {shown}' {why}.",
+            f"{self._name}: '{field} = {told}' {why}.",
             advice=f"Correct '{field}' in the header, or export the cube again.",
-            field=field, value=shown,
+            field=field, value=told,
         )  # fmt: skip
 
     def _required(self, field: str) -> str:
@@ -213,9 +248,12 @@ class _Reader:
             raise self._wrong(field, "holds something that is not a number") from None
 
     def _wavelength_units(self) -> str | None:
-        units = self._fields.get("wavelength units")
+        units = self._fields.get("wavelength units", "")
         # Spectrometers that leave the units out name them on the axis of the spectra's plot.
-        return units if units is not None else self._fields.get("z plot titles", "").partition(",")[0]
+        axis = self._fields.get("z plot titles", "").partition(",")[0]
+        if read_unit(units).kind == "none" and read_unit(axis).kind not in ("none", "index", "unrecognised"):
+            return axis
+        return units
 
     def _to_reflectance(self) -> float | None:
         field = "reflectance scale factor"

@@ -1,29 +1,33 @@
 """HDF5 and what is written in it: NetCDF4, MATLAB 7.3.
 
-A file may have been sent by a stranger: links, external storage and virtual datasets, which lead to other
-files of the machine, are not followed.
+Whatever is read of a file passes :mod:`specimap.core.cube.hdf_guard`, for a stranger may have sent it.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import h5py
 import numpy as np
 
 from specimap.core.cube.discover import Variable, choose_cube, choose_wavelengths, cube_axes
+from specimap.core.cube.hdf_guard import guarded_dataset, open_guarded
 from specimap.core.cube.model import Cube, describe
 from specimap.core.cube.pixels import ArrayPixels, Pixels
 from specimap.core.cube.scratch import scratch_array
 from specimap.core.cube.strided import native
-from specimap.core.errors import CubeContentError, CubeFormatError, CubeTruncatedError
+from specimap.core.errors import CubeContentError, CubeTruncatedError
 from specimap.core.geometry import Array, Floats
 
 # A larger row of chunks is not kept decoded while it is read by rows: the cube is unpacked once instead.
 _LARGEST_CHUNK_ROW = 512 << 20
 _TRUNCATED = re.compile(r"truncated file: eof = (\d+).*stored_eof = (\d+)")
+_UNIT_ATTRIBUTES = ("units", "unit", "wavelength_units")
+_LONGEST_UNITS = 64
+# The label of a dimension scale that stands for an axis without coordinates.
+_NETCDF_NO_NAME = "This is a netCDF dimension"
 _SCALE_NAMES = ("reflectance scale factor", "reflectance_scale_factor", "scale_factor")
 
 
@@ -36,19 +40,17 @@ class HdfFormat:
     def matches(self, path: Path) -> bool:
         return bool(h5py.is_hdf5(path))
 
-    def open(self, path: Path) -> Cube:
+    def open(self, path: Path, dataset: str | None = None) -> Cube:
         try:
-            with h5py.File(path, "r") as file:
+            with open_guarded(path) as file:
                 variables = _variables(file)
-                cube = choose_cube(path, variables)
-                wavelengths = choose_wavelengths(variables, cube)
-                values: Floats | None = None
-                if wavelengths is not None:
-                    values = np.array(file[wavelengths.name][()], np.float64).ravel()
-                reversed_axes = "MATLAB_class" in file[cube.name].attrs
+                cube, about_choice = choose_cube(path, variables, dataset)
+                node = guarded_dataset(path, file, cube.name)
+                wavelengths, values = _wavelengths(path, file, variables, cube)
+                reversed_axes = "MATLAB_class" in node.attrs
                 axes, warnings = cube_axes(cube, wavelengths, reversed_axes=reversed_axes)
-                scale = _to_reflectance(cube, file[cube.name].attrs)
-                pixels = _pixels(path, file[cube.name], axes)
+                scale = _to_reflectance(cube, node.attrs)
+                pixels = _pixels(path, node, axes)
         except OSError as error:
             sizes = _TRUNCATED.search(str(error))
             if sizes is None:
@@ -65,7 +67,7 @@ class HdfFormat:
             wavelengths=values,
             units=wavelengths.units if wavelengths else None,
             to_reflectance=scale,
-            warnings=warnings,
+            warnings=about_choice + warnings,
         )
 
 
@@ -73,13 +75,65 @@ def _variables(file: h5py.File) -> list[Variable]:
     found: list[Variable] = []
 
     def visit(name: str, node: object) -> None:  # visititems follows hard links alone
-        if isinstance(node, h5py.Dataset) and node.shape is not None:
+        if isinstance(node, h5py.Dataset) and node.shape is not None and (dtype := _dtype(node)) is not None:
             axes = tuple(_axis_name(node, i) for i in range(len(node.shape)))
-            units = _text(node.attrs.get("units", node.attrs.get("Units")))
-            found.append(Variable(name, tuple(node.shape), node.dtype, axes, units))
+            units = next((_text(node.attrs[key]) for key in node.attrs if key.lower() in _UNIT_ATTRIBUTES), None)
+            found.append(Variable(name, tuple(node.shape), dtype, axes, units, _content(name, node)))
 
     file.visititems(visit)
     return found
+
+
+def _content(name: str, node: h5py.Dataset) -> str | None:
+    """The text of a small data set called units: a string, or MATLAB's character codes."""
+    if "unit" not in name.rpartition("/")[2].lower() or not 0 < node.size <= _LONGEST_UNITS:
+        return None
+    if _text(node.attrs.get("MATLAB_class")) == "char" and node.dtype.kind == "u":
+        return "".join(chr(code) for code in np.asarray(node[()]).ravel(order="F"))
+    return _text(np.asarray(node[()])) if h5py.check_string_dtype(node.dtype) else None
+
+
+def _wavelengths(
+    path: Path, file: h5py.File, variables: list[Variable], cube: Variable
+) -> tuple[Variable | None, Floats | None]:
+    """The wavelengths' variable and its values: a data set, else an attribute of the cube or of a group above it."""
+    found = choose_wavelengths(variables, cube)
+    if found is not None:
+        return found, np.array(guarded_dataset(path, file, found.name)[()], np.float64).ravel()
+    node = file[cube.name]
+    while True:
+        lists = {}
+        told = []
+        for name, value in _attributes(node):
+            array = np.asarray(value)
+            if array.dtype.kind in "iuf" and array.size > 1:
+                lists[name] = Variable(name, array.shape, array.dtype), array
+            elif (text := _text(value)) is not None:
+                told.append(Variable(name, (), np.dtype(object), text=text))
+        found = choose_wavelengths([*(variable for variable, _ in lists.values()), *told], cube)
+        if found is not None and max(found.shape) in cube.shape:
+            return found, lists[found.name][1].astype(np.float64).ravel()
+        if node.name == "/":
+            return None, None
+        node = node.parent
+
+
+def _attributes(node: h5py.Dataset | h5py.Group) -> Iterator[tuple[str, object]]:
+    """Names and values of the attributes, without those of a type that NumPy has nothing like."""
+    for name in node.attrs:
+        try:
+            yield name, node.attrs[name]
+        except (TypeError, OSError):
+            continue
+
+
+def _dtype(node: h5py.Dataset) -> np.dtype | None:
+    """The type of its values; None for one that NumPy has nothing like (HDF5's times and bit fields)."""
+    try:
+        dtype: np.dtype = node.dtype
+    except TypeError:
+        return None
+    return dtype
 
 
 def _axis_name(node: h5py.Dataset, axis: int) -> str:
@@ -87,7 +141,10 @@ def _axis_name(node: h5py.Dataset, axis: int) -> str:
     try:
         if node.dims[axis].label:
             return str(node.dims[axis].label)
-        return str(node.dims[axis].keys()[0] or node.dims[axis][0].name).rpartition("/")[2]
+        label = str(node.dims[axis].keys()[0])
+        if not label or label.startswith(_NETCDF_NO_NAME):
+            label = str(node.dims[axis][0].name)
+        return label.rpartition("/")[2]
     except (IndexError, RuntimeError):
         return ""
 
@@ -114,11 +171,6 @@ def _to_reflectance(cube: Variable, attributes: Mapping[str, object]) -> float |
 
 
 def _pixels(path: Path, dataset: h5py.Dataset, axes: tuple[int, int, int]) -> Pixels:
-    if dataset.external or dataset.is_virtual:
-        raise CubeFormatError(
-            f"'{dataset.name}' in {path.name} keeps its values in other files.",
-            advice="Save the cube as one file.",
-        )
     offset = dataset.id.get_offset()
     if dataset.chunks is None and offset is not None:
         mapped = np.memmap(path, dataset.dtype, "r", offset=offset, shape=dataset.shape)
@@ -138,8 +190,8 @@ class _ChunkedPixels(Pixels):
 
     def __init__(self, path: Path, name: str, axes: tuple[int, int, int], chunk_rows: int, row_bytes: int) -> None:
         # A cache of its own that holds a row of chunks: each is decoded once, however few rows are asked for.
-        self._file = h5py.File(path, "r", rdcc_nbytes=max(1 << 20, row_bytes * 2), rdcc_nslots=100_003)
-        self._dataset = self._file[name]
+        self._file = open_guarded(path, rdcc_nbytes=max(1 << 20, row_bytes * 2), rdcc_nslots=100_003)
+        self._dataset = guarded_dataset(path, self._file, name)
         self._axes = axes
         self._chunk_rows = chunk_rows
         rows, cols, bands = (int(self._dataset.shape[axis]) for axis in axes)

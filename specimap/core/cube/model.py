@@ -32,7 +32,7 @@ class Cube:
 
     ``wavelengths_nm`` (B,) is NaN where the file names none; ``bad_bands`` (B,). ``to_reflectance`` times a
     raw value is reflectance; None where the values are counts. ``warnings`` are (code, sentence). ``files``
-    are those whose content makes the cube.
+    are those whose content makes the cube, ``datasets`` what was asked for by name in them.
     """
 
     path: Path
@@ -44,6 +44,7 @@ class Cube:
     quantity: Quantity
     to_reflectance: float | None
     warnings: Warnings
+    datasets: tuple[str | None, ...] = ()
 
     @property
     def rows(self) -> int:
@@ -94,9 +95,13 @@ class Cube:
     def fingerprint(self) -> str:
         """Hash of the content of all the cube's files, whatever their names: 64 hexadecimal digits.
 
-        SHA-256 of the SHA-256 digests of 16 MiB pieces, so that the cores share the work.
+        SHA-256 of the SHA-256 digests of 16 MiB pieces, so that the cores share the work. Data sets chosen by name
+        are part of it.
         """
-        return digest_files(self.files)
+        content = digest_files(self.files)
+        if not any(self.datasets):
+            return content
+        return hashlib.sha256(repr((content, self.datasets)).encode()).hexdigest()
 
 
 def digest_files(files: Sequence[Path]) -> str:
@@ -126,8 +131,11 @@ class CubeFormat(Protocol):
     def matches(self, path: Path) -> bool:
         """Whether the file at ``path`` (it exists) is of this format; cheap, never raises for bad content."""
 
-    def open(self, path: Path) -> Cube:
-        """The cube. Raises a leaf of SpecimapError; what a library raises is wrapped by the caller."""
+    def open(self, path: Path, dataset: str | None = None) -> Cube:
+        """The cube, of several in the file the one called ``dataset``.
+
+        Raises a leaf of SpecimapError; what a library raises is wrapped by the caller.
+        """
 
 
 def describe(

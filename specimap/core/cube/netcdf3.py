@@ -13,6 +13,7 @@ from specimap.core.cube.npy import starts_with
 from specimap.core.cube.pixels import ArrayPixels
 from specimap.core.geometry import Array, Floats
 
+_LONGEST_UNITS = 64
 _NETCDF3_MAGIC = (b"CDF\x01", b"CDF\x02")
 
 
@@ -25,13 +26,13 @@ class NetCdf3Format:
     def matches(self, path: Path) -> bool:
         return any(starts_with(path, magic) for magic in _NETCDF3_MAGIC)
 
-    def open(self, path: Path) -> Cube:
+    def open(self, path: Path, dataset: str | None = None) -> Cube:
         with netcdf_file(path, "r", mmap=True) as file:
             variables = [
-                Variable(name, tuple(v.shape), v.data.dtype, tuple(v.dimensions), _units(v))
+                Variable(name, tuple(v.shape), v.data.dtype, tuple(v.dimensions), _units(v), _content(name, v.data))
                 for name, v in file.variables.items()
             ]
-            cube = choose_cube(path, variables)
+            cube, about_choice = choose_cube(path, variables, dataset)
             wavelengths = choose_wavelengths(variables, cube)
             values: Floats | None = None
             if wavelengths is not None:
@@ -44,13 +45,21 @@ class NetCdf3Format:
             ArrayPixels(array.transpose(axes)),
             wavelengths=values,
             units=wavelengths.units if wavelengths else None,
-            warnings=warnings,
+            warnings=about_choice + warnings,
         )
 
 
 def _units(variable: object) -> str | None:
-    units = getattr(variable, "units", None)
+    told = {name.lower(): value for name, value in vars(variable).items()}
+    units = told.get("units", told.get("unit"))
     return units.decode("utf-8", "replace") if isinstance(units, bytes) else None
+
+
+def _content(name: str, data: Array) -> str | None:
+    """The text of a small variable of characters called units."""
+    if "unit" in name.lower() and data.dtype.kind == "S" and data.size <= _LONGEST_UNITS:
+        return data.tobytes().decode("utf-8", "replace")
+    return None
 
 
 def _mapped_again(path: Path, data: Array) -> Array:

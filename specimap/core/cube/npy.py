@@ -10,10 +10,12 @@ from typing import IO
 
 import numpy as np
 
-from specimap.core.cube.discover import Variable, choose_cube, choose_wavelengths
+from specimap.core.cube.discover import Variable, choose_cube, choose_wavelengths, cube_axes
 from specimap.core.cube.model import Cube, check_dtype, describe
 from specimap.core.cube.pixels import ArrayPixels
 from specimap.core.cube.scratch import bytes_of, scratch_array
+from specimap.core.cube.shown import shown
+from specimap.core.cube.wavelengths import Warnings
 from specimap.core.errors import CubeFormatError, CubeTruncatedError
 from specimap.core.geometry import Array, Floats
 
@@ -21,6 +23,7 @@ _NPY_MAGIC = b"\x93NUMPY"
 _ZIP_MAGIC = b"PK\x03\x04"
 _LOCAL_HEADER_BYTES = 30
 _PIECE = 8 << 20
+_LONGEST_UNITS = 512
 
 
 def starts_with(path: Path, magic: bytes) -> bool:
@@ -30,6 +33,15 @@ def starts_with(path: Path, magic: bytes) -> bool:
             return f.read(len(magic)) == magic
     except OSError:
         return False
+
+
+def refuse_dataset(path: Path, dataset: str | None) -> None:
+    """Raises CubeFormatError where one is named in a file that holds a single array."""
+    if dataset is not None:
+        raise CubeFormatError(
+            f"{path.name} holds one cube, and no data sets with names such as '{shown(dataset)}'.",
+            advice="Give the file alone, without '::'.",
+        )
 
 
 @dataclass(frozen=True)
@@ -78,17 +90,23 @@ class NpyFormat:
     def matches(self, path: Path) -> bool:
         return starts_with(path, _NPY_MAGIC)
 
-    def open(self, path: Path) -> Cube:
+    def open(self, path: Path, dataset: str | None = None) -> Cube:
+        refuse_dataset(path, dataset)
         with open(path, "rb") as stream:
             header = _read_npy_header(stream)
         check_dtype(path, header.dtype)
         if len(header.shape) != 3 or 0 in header.shape:
             raise CubeFormatError(
                 f"{path.name} holds an array of shape {header.shape}, not a cube.",
-                advice="Save an array of rows x columns x bands.",
+                advice="Save an array of three axes: rows x columns x bands.",
                 shape=list(header.shape),
             )
-        return describe(path, self.name, ArrayPixels(_mapped(path, header, header.header_bytes)))
+        warnings: Warnings = ()
+        if header.shape[0] == min(header.shape) < min(header.shape[1:]):
+            rows, cols, bands = header.shape
+            text = f"The array is taken as {rows} rows x {cols} columns x {bands} bands, as .npy has no names for axes."
+            warnings = (("axes_assumed", text),)
+        return describe(path, self.name, ArrayPixels(_mapped(path, header, header.header_bytes)), warnings=warnings)
 
 
 class NpzFormat:
@@ -100,27 +118,45 @@ class NpzFormat:
     def matches(self, path: Path) -> bool:
         return starts_with(path, _ZIP_MAGIC) and path.suffix.lower() in self.suffixes
 
-    def open(self, path: Path) -> Cube:
+    def open(self, path: Path, dataset: str | None = None) -> Cube:
         with zipfile.ZipFile(path) as archive:
             headers = {}
             for info in archive.infolist():
                 if info.filename.endswith(".npy"):
                     with archive.open(info) as stream:
                         headers[info.filename.removesuffix(".npy")] = _read_npy_header(stream)
-            variables = [Variable(name, h.shape, h.dtype) for name, h in headers.items()]
-            cube = choose_cube(path, variables)
+            variables = [
+                Variable(name, h.shape, h.dtype, text=_content(path, archive, name, headers))
+                for name, h in headers.items()
+            ]
+            cube, about_choice = choose_cube(path, variables, dataset)
             wavelengths = choose_wavelengths(variables, cube)
             values: Floats | None = None
             if wavelengths is not None:
                 values = np.array(_member(path, archive, wavelengths.name, headers), np.float64).ravel()
             array = _member(path, archive, cube.name, headers)
+        axes, about_axes = cube_axes(cube, wavelengths, reversed_axes=False)
+        if values is None:  # an archive follows .npy: rows x columns x bands, where nothing speaks against it
+            about_axes = ()
         return describe(
             path,
             self.name,
-            ArrayPixels(array),
+            ArrayPixels(array.transpose(axes)),
             wavelengths=values,
             units=wavelengths.units if wavelengths else None,
+            warnings=about_choice + about_axes,
         )
+
+
+def _content(path: Path, archive: zipfile.ZipFile, name: str, headers: dict[str, _NpyHeader]) -> str | None:
+    """The text of a small array called units."""
+    header = headers[name]
+    if "unit" not in name.lower() or header.dtype.kind not in "US" or header.data_bytes > _LONGEST_UNITS:
+        return None
+    if math.prod(header.shape) != 1:
+        return None
+    value = _member(path, archive, name, headers).ravel()[0]
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 
 def _member(path: Path, archive: zipfile.ZipFile, name: str, headers: dict[str, _NpyHeader]) -> Array:

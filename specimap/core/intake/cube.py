@@ -62,6 +62,7 @@ def judge_cube(path: Path) -> Verdict:
     Facts: rows, cols, bands, dtype, quantity, ``wavelength_nm`` (shortest, longest), warnings.
     """
     try:
+        _check_no_links(path.parent)
         cube = open_cube(path)
         warnings = cube.warnings + inspect(cube, _sampled_mean(cube))
     except StorageFullError:
@@ -78,6 +79,12 @@ def judge_cube(path: Path) -> Verdict:
         "wavelength_nm": _range(cube.wavelengths_nm), "warnings": _listed(warnings),
     }  # fmt: skip
     return Verdict(facts=facts)
+
+
+def _check_no_links(folder: Path) -> None:
+    """Raises CubeFormatError for a link among the files, which lie alone in their folder: none was uploaded."""
+    if any(file.is_symlink() for file in folder.iterdir()):
+        raise CubeFormatError("One of the cube's files is a link to another file.", advice="Upload the file itself.")
 
 
 def _sampled_mean(cube: Cube) -> NDArray[np.float32]:
