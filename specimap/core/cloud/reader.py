@@ -29,12 +29,14 @@ class Cloud(CloudArrays):
     # ---- spectra --------------------------------------------------------------------------------------
 
     def decode(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
-        """Stored values as reflectance, or as the counts the cube held."""
+        """Stored values as reflectance, or as the counts the cube held; NaN where there is none."""
         values = stored.astype(np.float32)
         if self.scale_factor != 1:
             values *= np.float32(self.scale_factor)
         if self.add_offset != 0:
             values += np.float32(self.add_offset)
+        if self.fill_value is not None:
+            values[stored == self.fill_value] = np.nan
         return values
 
     def spectra(

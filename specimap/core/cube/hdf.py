@@ -7,12 +7,12 @@ files of the machine, are not followed.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from pathlib import Path
 
 import h5py
 import numpy as np
 
+from specimap.core.cube.declared import WORDS, Declared, declared_of, plain
 from specimap.core.cube.discover import Variable, choose_cube, choose_wavelengths, cube_axes
 from specimap.core.cube.model import Cube, describe
 from specimap.core.cube.pixels import ArrayPixels, Pixels
@@ -24,7 +24,6 @@ from specimap.core.geometry import Array, Floats
 # A larger row of chunks is not kept decoded while it is read by rows: the cube is unpacked once instead.
 _LARGEST_CHUNK_ROW = 512 << 20
 _TRUNCATED = re.compile(r"truncated file: eof = (\d+).*stored_eof = (\d+)")
-_SCALE_NAMES = ("reflectance scale factor", "reflectance_scale_factor", "scale_factor")
 
 
 class HdfFormat:
@@ -47,7 +46,7 @@ class HdfFormat:
                     values = np.array(file[wavelengths.name][()], np.float64).ravel()
                 reversed_axes = "MATLAB_class" in file[cube.name].attrs
                 axes, warnings = cube_axes(cube, wavelengths, reversed_axes=reversed_axes)
-                scale = _to_reflectance(cube, file[cube.name].attrs)
+                declared = _declared(path, file, cube)
                 pixels = _pixels(path, file[cube.name], axes)
         except OSError as error:
             sizes = _TRUNCATED.search(str(error))
@@ -64,7 +63,7 @@ class HdfFormat:
             pixels,
             wavelengths=values,
             units=wavelengths.units if wavelengths else None,
-            to_reflectance=scale,
+            declared=declared,
             warnings=warnings,
         )
 
@@ -100,17 +99,21 @@ def _text(value: object) -> str | None:
     return value if isinstance(value, str) else None
 
 
-def _to_reflectance(cube: Variable, attributes: Mapping[str, object]) -> float | None:
-    """The factor of a dataset that calls itself reflectance; CF multiplies by it, NEON divides."""
-    names = (cube.name, _text(attributes.get("long_name")), _text(attributes.get("standard_name")))
-    if not any("reflect" in (name or "").lower() for name in names):
-        return None
-    for name, value in attributes.items():
-        if name.lower() in _SCALE_NAMES:
-            factor = float(np.asarray(value, np.float64).ravel()[0])
-            if np.isfinite(factor) and factor > 0:
-                return 1 / factor if factor > 1 else factor
-    return None
+def _declared(path: Path, file: h5py.File, cube: Variable) -> Declared:
+    """What the cube's own attributes say of its values, and small data sets beside it (MATLAB keeps them so)."""
+    dataset = file[cube.name]
+    said: dict[str, object] = {}
+    for name, node in dataset.parent.items():
+        if plain(name) in WORDS and is_own(node) and node.size in (1, *dataset.shape):
+            said[name] = node[()]
+    said |= {name: value for name, value in dataset.attrs.items() if plain(name) in (*WORDS, "unsigned")}
+    titles = (_text(dataset.attrs.get(title)) for title in ("long_name", "standard_name"))
+    return declared_of(path.name, said, cube.name, *titles)
+
+
+def is_own(node: object) -> bool:
+    """Whether a node is a data set whose values lie in the file itself."""
+    return isinstance(node, h5py.Dataset) and not node.external and not node.is_virtual and node.shape is not None
 
 
 def _pixels(path: Path, dataset: h5py.Dataset, axes: tuple[int, int, int]) -> Pixels:

@@ -10,8 +10,9 @@ from typing import IO
 
 import numpy as np
 
+from specimap.core.cube.declared import WORDS, declared_of, plain
 from specimap.core.cube.discover import Variable, choose_cube, choose_wavelengths
-from specimap.core.cube.model import Cube, check_dtype, describe
+from specimap.core.cube.model import Cube, check_dtype, describe, readable_dtype
 from specimap.core.cube.pixels import ArrayPixels
 from specimap.core.cube.scratch import bytes_of, scratch_array
 from specimap.core.errors import CubeFormatError, CubeTruncatedError
@@ -114,12 +115,15 @@ class NpzFormat:
             if wavelengths is not None:
                 values = np.array(_member(path, archive, wavelengths.name, headers), np.float64).ravel()
             array = _member(path, archive, cube.name, headers)
+            small = [v for v in variables if plain(v.name) in WORDS and math.prod(v.shape) in (1, *cube.shape)]
+            said = {v.name: _member(path, archive, v.name, headers) for v in small if readable_dtype(v.dtype)}
         return describe(
             path,
             self.name,
             ArrayPixels(array),
             wavelengths=values,
             units=wavelengths.units if wavelengths else None,
+            declared=declared_of(path.name, said, cube.name),
         )
 
 

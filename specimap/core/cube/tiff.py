@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from pathlib import Path
 
 import numpy as np
 import tifffile
 
+from specimap.core.cube.declared import WORDS, declared_of, plain
 from specimap.core.cube.model import Cube, check_dtype, describe
 from specimap.core.cube.npy import starts_with
 from specimap.core.cube.pixels import ArrayPixels
@@ -15,6 +17,10 @@ from specimap.core.cube.scratch import scratch_array
 from specimap.core.errors import CubeFormatError, CubeTruncatedError
 from specimap.core.geometry import Array, Floats
 
+_GDAL_METADATA, _GDAL_NODATA = 42112, 42113
+_GDAL_ITEM = re.compile(r"<Item\b[^>]*>([^<]*)</Item>")
+# CF's words, which mean the same.
+_GAINS, _OFFSETS = "scale_factor", "add_offset"
 _MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
@@ -35,9 +41,10 @@ class TiffFormat:
             axes = _axes(path, series.axes, series.shape)
             array = _values(path, file, series)
             wavelengths = _wavelengths(file)
+            declared = declared_of(path.name, _said(file))
         if len(axes) == 2:
             array, axes = array[..., None], (*axes, 2)
-        return describe(path, self.name, ArrayPixels(array.transpose(axes)), wavelengths=wavelengths)
+        return describe(path, self.name, ArrayPixels(array.transpose(axes)), wavelengths=wavelengths, declared=declared)
 
 
 def _check_complete(path: Path, file: tifffile.TiffFile, series: tifffile.TiffPageSeries) -> None:
@@ -101,3 +108,20 @@ def _wavelengths(file: tifffile.TiffFile) -> Floats | None:
         if isinstance(values, list):
             return np.array(values, np.float64)
     return None
+
+
+def _said(file: tifffile.TiffFile) -> dict[str, object]:
+    """What GDAL's tags and the JSON description that tifffile writes say of the values."""
+    said: dict[str, object] = {}
+    for described in file.shaped_metadata or ():
+        said |= {name: value for name, value in described.items() if plain(name) in WORDS}
+    tags = file.pages.first.tags
+    if _GDAL_NODATA in tags:
+        said["nodata"] = str(tags[_GDAL_NODATA].value)
+    if _GDAL_METADATA in tags:
+        text = str(tags[_GDAL_METADATA].value)
+        for role, name in (("scale", _GAINS), ("offset", _OFFSETS)):
+            numbers = [found[1] for found in _GDAL_ITEM.finditer(text) if f'role="{role}"' in found[0]]
+            if numbers:
+                said[name] = " ".join(numbers)
+    return said
