@@ -16,12 +16,13 @@ _SAMPLED_ROWS = 24
 _SAMPLED_PIXELS = 24 * 512
 # Fewer pixels at the largest value than this are glints or dead pixels, no saturation worth a word.
 _LEAST_SATURATED_SHARE = 0.001
+_LEAST_ZERO_SHARE = 0.002
 
 
 def inspect(cube: Cube, mean: NDArray[np.float32]) -> Warnings:
     """Warnings (code, sentence) about a cube's values; ``mean`` (rows, cols) is its mean image.
 
-    Codes: ``single_band``, ``bands_all_zero``, ``pixels_nan``, ``values_nan``, ``saturated``. Raises
+    Codes: ``single_band``, ``bands_all_zero``, ``pixels_nan``, ``values_nan``, ``pixels_zero``, ``saturated``. Raises
     CubeContentError for a cube without finite values, or whose values are all the same.
     """
     if not np.isfinite(mean).any():
@@ -45,6 +46,10 @@ def inspect(cube: Cube, mean: NDArray[np.float32]) -> Warnings:
     lost = int(np.isnan(mean).sum())
     if lost:
         warnings.append(("pixels_nan", f"{lost} of {mean.size} pixels hold no value in any good band."))
+    zero_pixels = int((mean == 0).sum())
+    if zero_pixels > _LEAST_ZERO_SHARE * mean.size:
+        text = f"{zero_pixels} of {mean.size} pixels are zero in all good bands, as where nothing was recorded."
+        warnings.append(("pixels_zero", f"{text} The file names no no-data value that says so."))
     holes = float(np.isnan(sample[..., ~cube.bad_bands]).mean()) if sample.dtype.kind == "f" else 0.0
     if holes > lost / mean.size:
         warnings.append(("values_nan", f"About {holes:.2%} of the values are missing (NaN)."))
