@@ -99,15 +99,19 @@ def test_float_reflectance_keeps_what_is_negative_large_or_missing(tmp_path: Pat
 def test_few_values_far_beyond_all_others_are_clipped_counted_and_flagged(tmp_path: Path) -> None:
     values = np.random.default_rng(0).random((70, 60, 5)).astype(np.float32)
     values[3, 4, 1] = 40.0
-    values[8, 8, 2] = -30.0
+    values[8, 8, 2] = -2.0
+    values[9, 8, 2] = 1e6
+    values[9, 9, 2] = -1e6
     written = write_cloud(tmp_path / "c.zarr", scene(70, 60, 1.0), FakeCube(values, to_reflectance=1.0), {})
     cloud = Cloud.open(tmp_path / "c.zarr")
     assert cloud.scale_factor == 1e-4
-    assert (written.clipped_below, written.clipped_above) == (1, 1)
-    assert [code for code, _ in written.remarks()] == ["values_clipped", "values_clipped"]
+    assert (written.clipped_below, written.clipped_above, written.absurd) == (1, 1, 2)
+    codes = [code for code, _ in written.remarks()]
+    assert codes == ["points_no_data", "values_absurd", "values_clipped", "values_clipped"]
     assert flagged(cloud, Flag.SATURATED) == {(3, 4)}
+    assert flagged(cloud, Flag.NO_DATA) == {(9, 8), (9, 9)}
     row, col = cloud.hsi_pixel.astype(int).T
-    want = np.clip(values[row, col], written.least, written.largest)
+    want = np.clip(np.where(np.abs(values) > 1e5, np.nan, values)[row, col], written.least, written.largest)
     np.testing.assert_allclose(cloud.spectra(slice(None)), want, rtol=0, atol=0.503e-4)
 
 

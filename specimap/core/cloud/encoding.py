@@ -17,6 +17,8 @@ from specimap.core.geometry import Array
 LARGEST = 65535
 # Blocks of this many spectra stay in the second-level cache between the passes over them.
 _BLOCK = 256
+# Values so many ranges below or above what can be stored were not measured.
+_FAR_BELOW, _FAR_ABOVE = 0.5, 8.0
 
 
 @dataclass(frozen=True)
@@ -103,10 +105,11 @@ class Encoding:
 
 @dataclass
 class Tally:
-    """What was found while spectra were gathered: values of good bands that were clipped at either end."""
+    """What was found while spectra were gathered: values of good bands that were clipped at either end, or left out."""
 
     below: int = 0
     above: int = 0
+    absurd: int = 0
 
 
 class Gatherer:
@@ -148,13 +151,18 @@ class Gatherer:
     def _settle(self, picked: Array, work: Array, flags: NDArray[np.uint8]) -> None:
         """Bring into range what cannot be stored, and flag and count it where the band is good."""
         top = self._encoding.top
-        missing = ~np.isfinite(picked) if self._encoding.fills else np.zeros(picked.shape, bool)
+        missing, absurd = np.zeros((2, *picked.shape), bool)
+        if self._encoding.fills:
+            missing = ~np.isfinite(picked)
+            absurd = ~missing & ((work < -_FAR_BELOW * top) | (work > _FAR_ABOVE * top))
+            missing |= absurd
         above, below = (work > top) & ~missing, (work < 0) & ~missing
         for run in self._runs:
             flags[missing[:, run].any(1)] |= np.uint8(Flag.NO_DATA)
             flags[above[:, run].any(1)] |= np.uint8(Flag.SATURATED)
             self.tally.above += int(above[:, run].sum())
             self.tally.below += int(below[:, run].sum())
+            self.tally.absurd += int(absurd[:, run].sum())
         np.clip(work, 0, top, out=work)
         work[missing] = NO_VALUE
 

@@ -95,6 +95,7 @@ def _written(flags: NDArray[np.uint8], tally: Tally, encoding: Encoding) -> Writ
         no_data=int(((flags & Flag.NO_DATA) > 0).sum()),
         clipped_below=tally.below,
         clipped_above=tally.above,
+        absurd=tally.absurd,
         least=encoding.add_offset,
         largest=encoding.add_offset + encoding.top * encoding.scale_factor,
     )

@@ -50,9 +50,14 @@ def inspect(cube: Cube, mean: NDArray[np.float32]) -> Warnings:
     if zero_pixels > _LEAST_ZERO_SHARE * mean.size:
         text = f"{zero_pixels} of {mean.size} pixels are zero in all good bands, as where nothing was recorded."
         warnings.append(("pixels_zero", f"{text} The file names no no-data value that says so."))
-    holes = float(np.isnan(sample[..., ~cube.bad_bands]).mean()) if sample.dtype.kind == "f" else 0.0
-    if holes > lost / mean.size:
-        warnings.append(("values_nan", f"About {holes:.2%} of the values are missing (NaN)."))
+    if sample.dtype.kind == "f":
+        missing = np.isnan(sample[..., ~cube.bad_bands])
+        partly = missing & ~missing.all(-1, keepdims=True)
+        holes = float(partly.mean())
+    else:
+        holes = 0.0
+    if holes:
+        warnings.append(("values_nan", f"About {holes:.2%} of the values are missing in pixels that have others."))
     share = saturated_share(sample[..., ~cube.bad_bands], _level(cube, columns))
     if share > _LEAST_SATURATED_SHARE:
         warnings.append(("saturated", f"About {share:.1%} of the pixels are saturated in at least one band."))
