@@ -103,15 +103,18 @@ def _declared(path: Path, file: h5py.File, cube: Variable) -> Declared:
     """What the cube's own attributes say of its values, and small data sets beside it (MATLAB keeps them so)."""
     dataset = file[cube.name]
     said: dict[str, object] = {}
-    for name, node in dataset.parent.items():
-        if plain(name) in WORDS and is_own(node) and node.size in (1, *dataset.shape):
-            said[name] = node[()]
+    for name in dataset.parent:
+        # Links may lead out of the file: only what stands in it is looked at.
+        if plain(name) in WORDS and isinstance(dataset.parent.get(name, getlink=True), h5py.HardLink):
+            node = dataset.parent[name]
+            if _is_own(node) and node.size in (1, *dataset.shape):
+                said[name] = node[()]
     said |= {name: value for name, value in dataset.attrs.items() if plain(name) in (*WORDS, "unsigned")}
     titles = (_text(dataset.attrs.get(title)) for title in ("long_name", "standard_name"))
     return declared_of(path.name, said, cube.name, *titles)
 
 
-def is_own(node: object) -> bool:
+def _is_own(node: object) -> bool:
     """Whether a node is a data set whose values lie in the file itself."""
     return isinstance(node, h5py.Dataset) and not node.external and not node.is_virtual and node.shape is not None
 

@@ -18,7 +18,7 @@ from specimap.core.errors import CubeFormatError, CubeTruncatedError
 from specimap.core.geometry import Array, Floats
 
 _GDAL_METADATA, _GDAL_NODATA = 42112, 42113
-_GDAL_ITEM = re.compile(r"<Item\b[^>]*>([^<]*)</Item>")
+_GDAL_ITEM = re.compile(r"<Item\b[^>]*\bsample=\"(\d+)\"[^>]*>([^<]*)</Item>")
 # CF's words, which mean the same.
 _GAINS, _OFFSETS = "scale_factor", "add_offset"
 _MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -41,7 +41,7 @@ class TiffFormat:
             axes = _axes(path, series.axes, series.shape)
             array = _values(path, file, series)
             wavelengths = _wavelengths(file)
-            declared = declared_of(path.name, _said(file))
+            declared = declared_of(path.name, _said(file, array.shape[axes[2]] if len(axes) == 3 else 1))
         if len(axes) == 2:
             array, axes = array[..., None], (*axes, 2)
         return describe(path, self.name, ArrayPixels(array.transpose(axes)), wavelengths=wavelengths, declared=declared)
@@ -110,7 +110,7 @@ def _wavelengths(file: tifffile.TiffFile) -> Floats | None:
     return None
 
 
-def _said(file: tifffile.TiffFile) -> dict[str, object]:
+def _said(file: tifffile.TiffFile, bands: int) -> dict[str, object]:
     """What GDAL's tags and the JSON description that tifffile writes say of the values."""
     said: dict[str, object] = {}
     for described in file.shaped_metadata or ():
@@ -120,8 +120,11 @@ def _said(file: tifffile.TiffFile) -> dict[str, object]:
         said["nodata"] = str(tags[_GDAL_NODATA].value)
     if _GDAL_METADATA in tags:
         text = str(tags[_GDAL_METADATA].value)
-        for role, name in (("scale", _GAINS), ("offset", _OFFSETS)):
-            numbers = [found[1] for found in _GDAL_ITEM.finditer(text) if f'role="{role}"' in found[0]]
-            if numbers:
-                said[name] = " ".join(numbers)
+        for role, name, usual in (("scale", _GAINS, "1"), ("offset", _OFFSETS, "0")):
+            numbers = [usual] * bands
+            for found in _GDAL_ITEM.finditer(text):
+                sample = int(found[1])
+                if f'role="{role}"' in found[0] and sample < bands:
+                    numbers[sample] = found[2]
+            said[name] = " ".join(numbers)
     return said
