@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from specimap.core.cube.declared import WORDS, plain
 from specimap.core.cube.model import readable_dtype
 from specimap.core.cube.shown import shown
 from specimap.core.cube.spectral_units import read_unit
@@ -148,6 +149,16 @@ def _refusal(path: Path, what: str, variables: Sequence[Variable]) -> CubeFormat
         variables=[shown(v.name) for v in arrays[:20]],
         shapes=[list(v.shape[:_SHOWN]) for v in arrays[:20]],
     )
+
+
+def declaring(variables: Sequence[Variable], cube: Variable) -> list[Variable]:
+    """The small variables beside the cube whose names declare what its values mean (see ``declared``)."""
+    folder = cube.name.rpartition("/")[0]
+    return [
+        v for v in variables
+        if plain(v.short_name) in WORDS and v.name.rpartition("/")[0] == folder
+        and math.prod(v.shape) in (1, *cube.shape) and readable_dtype(v.dtype)
+    ]  # fmt: skip
 
 
 def choose_wavelengths(variables: Sequence[Variable], cube: Variable) -> Variable | None:

@@ -10,7 +10,8 @@ from typing import IO
 
 import numpy as np
 
-from specimap.core.cube.discover import Variable, choose_cube, choose_wavelengths, cube_axes
+from specimap.core.cube.declared import declared_of
+from specimap.core.cube.discover import Variable, choose_cube, choose_wavelengths, cube_axes, declaring
 from specimap.core.cube.model import Cube, check_dtype, describe
 from specimap.core.cube.pixels import ArrayPixels
 from specimap.core.cube.scratch import bytes_of, scratch_array
@@ -135,6 +136,7 @@ class NpzFormat:
             if wavelengths is not None:
                 values = np.array(_member(path, archive, wavelengths.name, headers), np.float64).ravel()
             array = _member(path, archive, cube.name, headers)
+            said = {v.short_name: _member(path, archive, v.name, headers) for v in declaring(variables, cube)}
         axes, about_axes = cube_axes(cube, wavelengths, reversed_axes=False)
         if values is None:  # an archive follows .npy: rows x columns x bands, where nothing speaks against it
             about_axes = ()
@@ -144,6 +146,7 @@ class NpzFormat:
             ArrayPixels(array.transpose(axes)),
             wavelengths=values,
             units=wavelengths.units if wavelengths else None,
+            declared=declared_of(path.name, said, cube.name),
             warnings=about_choice + about_axes,
         )
 
