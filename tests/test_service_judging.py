@@ -173,7 +173,7 @@ for line in sys.stdin:
     if what == "crash": os.abort()
     if what == "hang": time.sleep(3600)
     if what == "garble": print("no json", flush=True)
-    else: print(json.dumps({"verdict": "accepted", "pid": os.getpid()}), flush=True)
+    else: print(json.dumps({"verdict": "accepted", "code": None, "reason": "", "advice": "", "pid": os.getpid()}), flush=True)
 """
 
 
