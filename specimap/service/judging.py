@@ -1,5 +1,5 @@
-"""Judging of arrived files in child processes, which reach that file alone: a hostile one costs a child's copy of itself,
-and neither the service nor any other file. What a child says is checked before it is believed."""
+"""Judging of arrived files in child processes that reach that file alone: a hostile one costs a copy of a child, and
+neither the service nor any other file. What a child says is checked before it is believed."""
 
 from __future__ import annotations
 

@@ -46,9 +46,10 @@ class Reach:
 
 def program_rules(reach: Reach) -> list[Rule]:
     """The rules for this interpreter with its modules, for the system's libraries, and for ``reach``."""
-    kept = [_real(path) for path in (*reach.keep_from, *reach.read, *reach.write)]
+    kept = [_real(path) for path in reach.keep_from]
+    data = [*kept, *(_real(path) for path in (*reach.read, *reach.write))]
     own = [(place, landlock.RUN) for place in (*map(Path, _LIBRARIES), *_of_interpreter(), *reach.run)]
-    own += [(place, landlock.READ) for place in (*map(Path, _FILES), *_module_folders(kept), *_caches())]
+    own += [(place, landlock.READ) for place in (*map(Path, _FILES), *_module_folders(data), *_caches())]
     # Python finds a module by listing its folder.
     own.append((_PACKAGE.parent, landlock.READ_DIR))
     own.append((Path("/dev/null"), landlock.READ | landlock.WRITE_FILE))
@@ -87,17 +88,17 @@ def _without(place: Path, kept: Sequence[Path]) -> Iterator[Path]:
 
 def _of_interpreter() -> Iterator[Path]:
     yield from (Path(place) for place in {sys.prefix, sys.exec_prefix, sys.base_prefix, sys.base_exec_prefix})
-    yield Path(os.path.realpath(sys.executable)).parents[1]
+    yield from interpreter_places(sys.executable)
     yield from (Path(place) for place in os.environ.get("LD_LIBRARY_PATH", "").split(":") if place)
 
 
-def _module_folders(kept: Sequence[Path]) -> Iterator[Path]:
+def _module_folders(data: Sequence[Path]) -> Iterator[Path]:
     """Folders of modules, but none that holds other things too: where data lie, or where the program was started."""
     yield _PACKAGE
     main = getattr(sys.modules.get("__main__"), "__file__", None)
     beside = {_real(Path(os.curdir)), _PACKAGE.parent, *([_real(Path(main)).parent] if main else [])}
     for place in map(Path, filter(None, sys.path)):
-        if _real(place) not in beside and not any(_real(place) in path.parents for path in kept):
+        if _real(place) not in beside and not any(_real(place) in path.parents for path in data):
             yield place
     if _PACKAGE.parent.name in ("site-packages", "dist-packages"):
         yield _PACKAGE.parent
@@ -118,6 +119,5 @@ def _gpu_devices() -> Iterator[Path]:
 
 def interpreter_places(python: str) -> Iterable[Path]:
     """What another interpreter is made of: its own environment and the one that this was made from."""
-    path = Path(os.path.abspath(python))
-    yield path.parents[1]
-    yield Path(os.path.realpath(path)).parents[1]
+    for path in (os.path.abspath(python), os.path.realpath(python)):
+        yield Path(path).parent.parent
