@@ -28,8 +28,8 @@ from specimap.core.reconstruct.learned.environment import BACKEND_VARIABLES, DEV
 from specimap.core.reconstruct.learned.process import child_environment
 from specimap.core.reconstruct.learned.required import check_required
 from specimap.core.reconstruct.mast3r import settings as mast3r
-from specimap.workers.plan import plan_of
 from specimap.workers.cells import Cells
+from specimap.workers.plan import plan_of
 from specimap.workers.processes import StageProcess
 
 Bring = Callable[[Path, pytest.MonkeyPatch], Path]

@@ -19,6 +19,7 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from specimap.core.fiducials import detect_markers
 from specimap.core.intake.cube import judge_cube, judge_part
 from specimap.core.intake.photo import Others, judge_photo
 from specimap.core.intake.verdict import Verdict
-from specimap.core.sandbox import MODES, Mode, Reach, confine, program_rules
+from specimap.core.sandbox import MODES, Confinement, Mode, Reach, program_rules
 from specimap.core.sandbox.landlock import READ, WRITE
 from specimap.core.sandbox.places import Rule
 
@@ -67,47 +68,62 @@ def _end_with_parent() -> None:
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
 
 
-def _in_copy(task: dict[str, Any], memory: int, rules: list[Rule], mode: Mode) -> bytes:
-    """The answer to a task, of a copy of this process that can reach the task's file alone."""
-    reading, writing = os.pipe()
-    pid = os.fork()
-    if pid == 0:
-        try:
-            _answer(task, memory, rules, mode, writing)
-        except BaseException:
-            traceback.print_exc()
-            os._exit(1)
-        os._exit(0)
-    os.close(writing)
-    said = b""
-    with open(reading, "rb", buffering=0) as pipe:
-        while len(said) <= LARGEST_ANSWER and (piece := pipe.read(1 << 16)):
-            said += piece
-    if len(said) > LARGEST_ANSWER:
-        os.kill(pid, signal.SIGKILL)
-    _, status = os.waitpid(pid, 0)
-    # One line and no more: what follows would be taken for the next file's answer.
-    fine = status == 0 and len(said) <= LARGEST_ANSWER and said.endswith(b"\n") and said.count(b"\n") == 1
-    return said if fine else json.dumps(DIED).encode() + b"\n"
+class Copy:
+    """A copy of this process, for one file. It is made ahead, since copying takes as long as a small photo."""
+
+    def __init__(self, memory: int, rules: list[Rule], mode: Mode) -> None:
+        task, self._task = os.pipe()
+        self._answer, answer = os.pipe()
+        self.pid = os.fork()
+        if self.pid == 0:
+            try:
+                _judge_one(task, answer, memory, rules, mode)
+            except BaseException:
+                traceback.print_exc()
+                os._exit(1)
+            os._exit(0)
+        os.close(task)
+        os.close(answer)
+
+    def judge(self, line: str) -> bytes:
+        """Its answer to a task, one line each; :meth:`end` follows."""
+        with open(self._task, "wb", buffering=0) as pipe, suppress(BrokenPipeError):
+            pipe.write(line.encode())
+        said = b""
+        with open(self._answer, "rb", buffering=0) as pipe:
+            while b"\n" not in said and len(said) <= LARGEST_ANSWER and (piece := pipe.read(1 << 16)):
+                said += piece
+        # One line and no more: what follows would be taken for the next file's answer.
+        line_said, end, _ = said.partition(b"\n")
+        return line_said + end if end else json.dumps(DIED).encode() + b"\n"
+
+    def end(self) -> None:
+        """End it. That takes as long as making it: the answer is sent before."""
+        os.kill(self.pid, signal.SIGKILL)
+        os.waitpid(self.pid, 0)
 
 
-def _answer(task: dict[str, Any], memory: int, rules: list[Rule], mode: Mode, writing: int) -> None:
+def _judge_one(reading: int, writing: int, memory: int, rules: list[Rule], mode: Mode) -> None:
     _end_with_parent()
     # The pipes to the service are not for this copy: it could read the next tasks, and answer them.
     nothing = os.open(os.devnull, os.O_RDWR)
     for descriptor in (0, 1, 2):
         os.dup2(nothing, descriptor)
-    for descriptor in _open_descriptors() - {0, 1, 2, writing}:
+    for descriptor in _open_descriptors() - {0, 1, 2, reading, writing}:
         os.close(descriptor)
+    confinement, at_rest = Confinement(rules, mode), _address_space()
+    with open(reading, encoding="utf-8") as pipe:
+        line = pipe.readline()
+    if not line:
+        return
+    task = json.loads(line)
     folder, scratch = Path(task["path"]).parent, task["scratch"]
     os.environ["TMPDIR"] = tempfile.tempdir = scratch
     # Cubes are mapped, which takes addresses and no memory.
     mapped = sum(f.stat().st_size for f in folder.iterdir()) if task["kind"] == "cube" else 0
-    for limit, most in (
-        (resource.RLIMIT_AS, _address_space() + memory + mapped), (resource.RLIMIT_NOFILE, MOST_OPEN),
-    ):  # fmt: skip
+    for limit, most in ((resource.RLIMIT_AS, at_rest + memory + mapped), (resource.RLIMIT_NOFILE, MOST_OPEN)):
         resource.setrlimit(limit, (most, most))
-    confine([*rules, (str(folder), READ), (scratch, WRITE)], mode, alone=True)
+    confinement.enter([(str(folder), READ), (scratch, WRITE)], alone=True)
     answer = json.dumps(TASKS[task["kind"]](task).as_dict()).encode() + b"\n"
     while answer:
         answer = answer[os.write(writing, answer) :]
@@ -139,9 +155,12 @@ def main() -> None:
     detect_markers(np.zeros((64, 64), np.uint8), "DICT_4X4_50", expected=0)  # fills OpenCV's tables
     Image.init()
     rules = program_rules(Reach(keep_from=[Path(place) for place in sys.argv[4:]]))
+    copy = Copy(memory, rules, mode)
     out.write(json.dumps({"ready": True}).encode() + b"\n")
     for line in sys.stdin:
-        out.write(_in_copy(json.loads(line), memory, rules, mode))
+        out.write(copy.judge(line))
+        copy.end()
+        copy = Copy(memory, rules, mode)
 
 
 if __name__ == "__main__":

@@ -5,9 +5,10 @@ reads such files does it in a process that has given up, before it loads a libra
 the standard library is imported here.
 """
 
-from specimap.core.sandbox.launch import Protection, confine, confined, hide_from_others, protection
+from specimap.core.sandbox.launch import Confinement, Protection, confined, hide_from_others, protection
 from specimap.core.sandbox.places import MODES, Mode, Reach, program_rules
 
 __all__ = [
-    "MODES", "Mode", "Protection", "Reach", "confine", "confined", "hide_from_others", "program_rules", "protection",
+    "MODES", "Confinement", "Mode", "Protection", "Reach", "confined", "hide_from_others", "program_rules",
+    "protection",
 ]  # fmt: skip

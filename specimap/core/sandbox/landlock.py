@@ -45,34 +45,41 @@ def abi() -> int:
     return max(0, _call(CREATE, None, 0, VERSION))
 
 
-def restrict(rules: Iterable[tuple[Path, int]]) -> None:
-    """Let this thread, and whatever it starts from now on, reach nothing but ``rules``: places and rights to them.
+@lru_cache(maxsize=1)
+def library() -> ctypes.CDLL:
+    """The C library, whose calls set ``ctypes.get_errno()``."""
+    return ctypes.CDLL(None, use_errno=True)
 
-    Places that do not exist are passed over. Threads that run already are not restricted.
 
-    Raises:
-        OSError: the kernel refuses.
-    """
-    version = abi()
-    files = (1 << _FILES_BY_ABI.get(version, 16)) - 1
-    attributes = struct.pack("=QQQ", files, _TCP if version >= 4 else 0, _SCOPES if version >= 6 else 0)
-    ruleset = _checked(CREATE, attributes, len(attributes), 0)
-    try:
+class Ruleset:
+    """Places and rights to them, collected and then enforced. Raises OSError where the kernel refuses."""
+
+    def __init__(self) -> None:
+        version = abi()
+        self._files = (1 << _FILES_BY_ABI.get(version, 16)) - 1
+        attributes = struct.pack("=QQQ", self._files, _TCP if version >= 4 else 0, _SCOPES if version >= 6 else 0)
+        self._handle = _checked(CREATE, attributes, len(attributes), 0)
+
+    def allow(self, rules: Iterable[tuple[Path | str, int]]) -> None:
+        """Add places; those that do not exist are passed over."""
         for place, rights in rules:
-            _allow(ruleset, place, rights & files)
+            _allow(self._handle, place, rights & self._files)
+
+    def enforce(self) -> None:
+        """Let this thread, and whatever it starts from now on, reach nothing else. Threads that run already are not
+        restricted."""
         give_up_new_rights()
-        _checked(RESTRICT, ruleset, 0)
-    finally:
-        os.close(ruleset)
+        _checked(RESTRICT, self._handle, 0)
+        os.close(self._handle)
 
 
 def give_up_new_rights() -> None:
     """No program that this process runs gains a right; without it an ordinary user may not restrict itself."""
-    if ctypes.CDLL(None, use_errno=True).prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0):
+    if library().prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0):
         raise OSError(ctypes.get_errno(), "PR_SET_NO_NEW_PRIVS")
 
 
-def _allow(ruleset: int, place: Path, rights: int) -> None:
+def _allow(ruleset: int, place: Path | str, rights: int) -> None:
     try:
         handle = os.open(place, os.O_PATH | os.O_CLOEXEC)
     except OSError:
@@ -87,7 +94,7 @@ def _allow(ruleset: int, place: Path, rights: int) -> None:
 
 def _call(number: int, *arguments: int | bytes | None) -> int:
     passed = (ctypes.c_long(value) if isinstance(value, int) else ctypes.c_char_p(value) for value in arguments)
-    return int(ctypes.CDLL(None, use_errno=True).syscall(ctypes.c_long(number), *passed))
+    return int(library().syscall(ctypes.c_long(number), *passed))
 
 
 def _checked(number: int, *arguments: int | bytes | None) -> int:

@@ -7,7 +7,7 @@ import json
 import os
 import struct
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -66,40 +66,57 @@ def confined(command: Sequence[str], reach: Reach, mode: Mode) -> list[str]:
     return [sys.executable, "-I", "-S", "-B", "-c", _LAUNCHER, package, plan, *command]
 
 
-def confine(rules: Sequence[Rule], mode: Mode, *, alone: bool) -> None:
-    """Give up, for good, whatever ``rules`` do not name; ``alone`` as of :func:`seccomp.restrict`.
+class Confinement:
+    """Gives up, for good, whatever ``rules`` do not name: what can be done ahead at once, the rest by :meth:`enter`."""
 
-    Threads that run already keep their reach of files: call it before there are any.
+    def __init__(self, rules: Sequence[Rule], mode: Mode) -> None:
+        self._mode = mode
+        self._failed: OSError | None = None
+        self._ruleset: landlock.Ruleset | None = None
+        if mode != "off":
+            self._attempt(_drop_capabilities)
+            self._attempt(lambda: self._collect(rules))
 
-    Raises:
-        OSError: not all of it could be given up, and ``mode`` requires that.
-    """
-    if mode == "off":
-        return
-    failed: OSError | None = None
-    for step in (
-        _drop_capabilities,
-        lambda: landlock.restrict((Path(place), rights) for place, rights in rules),
-        lambda: seccomp.restrict(alone=alone),
-    ):
+    def enter(self, more: Sequence[Rule] = (), *, alone: bool) -> None:
+        """Reach nothing but the rules and ``more`` from now on; ``alone`` as of :func:`seccomp.restrict`.
+
+        Threads that run already keep their reach of files: call it before there are any.
+
+        Raises:
+            OSError: not all of it could be given up, and the mode requires that.
+        """
+        if self._mode == "off":
+            return
+        self._attempt(lambda: self._enforce(more))
+        self._attempt(lambda: seccomp.restrict(alone=alone))
+        if self._mode == "require" and (self._failed or not protection().whole):
+            raise self._failed or OSError(0, f"The kernel has no {protection().missing}.")
+
+    def _collect(self, rules: Sequence[Rule]) -> None:
+        self._ruleset = landlock.Ruleset()
+        self._ruleset.allow(rules)
+
+    def _enforce(self, more: Sequence[Rule]) -> None:
+        if self._ruleset is not None:
+            self._ruleset.allow(more)
+            self._ruleset.enforce()
+
+    def _attempt(self, step: Callable[[], None]) -> None:
         try:
             step()
         except OSError as error:
-            failed = failed or error
-    whole = protection().whole
-    if mode == "require" and (failed or not whole):
-        raise failed or OSError(0, f"The kernel has no {protection().missing}.")
+            self._failed = self._failed or error
 
 
 def hide_from_others() -> None:
     """Let no process of the same user look into this one: not at its memory, nor at the keys in its environment."""
     if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_DUMPABLE, 0, 0, 0, 0)
+        landlock.library().prctl(_PR_SET_DUMPABLE, 0, 0, 0, 0)
 
 
 def _drop_capabilities() -> None:
     """Root without its rights: it can read other users' files no more."""
-    library = ctypes.CDLL(None, use_errno=True)
+    library = landlock.library()
     for capability in range(64):
         library.prctl(_PR_CAPBSET_DROP, capability, 0, 0, 0)
     number = _CAPSET.get(os.uname().machine)
@@ -114,7 +131,7 @@ def main(arguments: list[str]) -> None:
     """Run a command, confined: its plan as JSON, then the command. Does not return."""
     plan = json.loads(arguments[0])
     try:
-        confine([(place, rights) for place, rights in plan["rules"]], plan["mode"], alone=False)
+        Confinement([(place, rights) for place, rights in plan["rules"]], plan["mode"]).enter(alone=False)
         os.execv(arguments[1], arguments[1:])
     except OSError as error:
         sys.stderr.write(f"The process could not be confined: {error}.\n")

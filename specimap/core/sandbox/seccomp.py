@@ -14,7 +14,7 @@ import struct
 import sys
 from collections.abc import Sequence
 
-from specimap.core.sandbox.landlock import give_up_new_rights
+from specimap.core.sandbox.landlock import give_up_new_rights, library
 
 # Numbers on x86-64 and on AArch64; None where there is no such call.
 _ALWAYS: dict[str, tuple[int | None, int | None]] = {
@@ -71,8 +71,7 @@ def available() -> bool:
     if sys.platform != "linux" or platform.machine() not in _MACHINES:
         return False
     # Asked with no filter, a kernel that knows it complains of the address (EFAULT), one that does not of the call.
-    call = ctypes.CDLL(None, use_errno=True).syscall
-    call(ctypes.c_long(_SECCOMP[platform.machine()]), ctypes.c_long(_SET_FILTER), ctypes.c_long(0), None)
+    library().syscall(ctypes.c_long(_SECCOMP[platform.machine()]), ctypes.c_long(_SET_FILTER), ctypes.c_long(0), None)
     return ctypes.get_errno() == errno.EFAULT
 
 
@@ -89,7 +88,7 @@ def restrict(*, alone: bool) -> None:
     buffer = ctypes.create_string_buffer(code, len(code))
     filter = struct.pack("@HP", len(program), ctypes.addressof(buffer))
     give_up_new_rights()
-    answer = ctypes.CDLL(None, use_errno=True).syscall(
+    answer = library().syscall(
         ctypes.c_long(_SECCOMP[platform.machine()]), ctypes.c_long(_SET_FILTER), ctypes.c_long(_ALL_THREADS), filter
     )
     if answer:
