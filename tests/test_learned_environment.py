@@ -28,6 +28,7 @@ from specimap.core.reconstruct.learned.environment import BACKEND_VARIABLES, DEV
 from specimap.core.reconstruct.learned.process import child_environment
 from specimap.core.reconstruct.learned.required import check_required
 from specimap.core.reconstruct.mast3r import settings as mast3r
+from specimap.workers.cells import Cells
 from specimap.workers.plan import plan_of
 from specimap.workers.processes import StageProcess
 
@@ -72,7 +73,8 @@ def test_a_stages_process_sees_the_variables_of_backends_and_no_secret(tmp_path:
         del stage, share
 
     async def run() -> None:
-        process = await StageProcess.start([sys.executable, "-c", TELLS])
+        cells = Cells(tmp_path, "test", "off", ())
+        process = await StageProcess.start([sys.executable, "-c", TELLS], cells)
         await process.run({"stage": "reconstruct", "out": str(tmp_path)}, heard, 30)
 
     asyncio.run(run())

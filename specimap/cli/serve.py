@@ -12,6 +12,8 @@ import sqlalchemy as sa
 
 from specimap.cli.supervisor import Supervisor
 from specimap.core.errors import SettingsError
+from specimap.core.sandbox import hide_from_others
+from specimap.infra.confinement import check_confinement
 from specimap.infra.database import Database
 from specimap.infra.logs import set_up_logs
 from specimap.infra.migrate import alone, migrate
@@ -34,6 +36,8 @@ def serve(*, workers: bool, say: Callable[[str], None]) -> None:
 
     settings = load_settings()
     set_up_logs(settings)
+    check_confinement(settings)
+    hide_from_others()
     listener = _listen(settings)
     database = Database.open(settings.database)
     try:
@@ -80,6 +84,8 @@ def work(*, slots: int | None, kind: str) -> None:
     """
     settings = load_settings()
     set_up_logs(settings)
+    check_confinement(settings)
+    hide_from_others()
     database = Database.open(settings.database)
     try:
         migrate(database)

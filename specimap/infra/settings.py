@@ -11,6 +11,7 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 
 from specimap.core.errors import SettingsError
 from specimap.core.reconstruct.learned.environment import BACKEND_VARIABLES, check_environment
+from specimap.core.sandbox import Mode
 
 CONFIG_VARIABLE = "SPECIMAP_CONFIG"
 """Names a TOML file with the same settings, lower case and without the prefix; the environment wins."""
@@ -77,6 +78,11 @@ class ServiceSettings(BaseSettings):
     judge_seconds: float = Field(default=60, gt=0, description="Longest time that the judging of one file may take.")
     judge_memory_bytes: int = Field(
         default=3 * GIB, ge=256 * MIB, description="Most memory that the judging of files may take."
+    )
+
+    sandbox: Mode = Field(
+        default="best-effort",
+        description="Whether what reads uploaded files is confined to them by the kernel: `require` refuses to start where it cannot be, `best-effort` warns, `off` does without.",
     )
 
     slots: int = Field(default=1, ge=1, le=64, description="Jobs that one `specimap worker` runs side by side.")
@@ -157,6 +163,18 @@ class ServiceSettings(BaseSettings):
     def scratch(self) -> Path:
         """Folder for what is under way; on a local disk."""
         return self.scratch_dir or self.data_dir / "scratch"
+
+    @property
+    def private_places(self) -> list[Path]:
+        """Local folders and files that no process which reads uploaded files may see as a whole."""
+        places = [self.data_dir, self.scratch]
+        if not self.storage_place.startswith("s3://"):
+            places.append(Path(self.storage_place))
+        if self.database.startswith("sqlite:///"):
+            places.append(Path(self.database.removeprefix("sqlite:///")))
+        if file := os.environ.get(CONFIG_VARIABLE):
+            places.append(Path(file))
+        return [place.absolute() for place in places]
 
 
 def load_settings(**given: object) -> ServiceSettings:

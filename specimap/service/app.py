@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
+from anyio import CapacityLimiter
 from fastapi import FastAPI
 from fastapi_offline import FastAPIOffline
 from starlette.middleware.cors import CORSMiddleware
@@ -13,7 +14,7 @@ from specimap import __version__
 from specimap.infra.settings import ServiceSettings
 from specimap.service import problems
 from specimap.service.auth import Keyring
-from specimap.service.bodies import JsonLimit
+from specimap.service.bodies import Gate
 from specimap.service.context import AppContext
 from specimap.service.middleware import Observed
 from specimap.service.routers import (  # fmt: skip
@@ -30,6 +31,7 @@ from specimap.service.routers import (  # fmt: skip
     uploads,
     zarr,
 )
+from specimap.service.spectra import SpectraRequest
 
 DESCRIPTION = """\
 Photos and one hyperspectral cube of an excised specimen to a metric 3D point cloud in which every point carries its
@@ -65,12 +67,15 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     )
     app.state.context = context
     app.state.keyring = Keyring(context.database, settings.rate_per_minute, settings.quota_bytes)
+    app.state.parsing = CapacityLimiter(1)
     problems.install(app)
-    problems.describe(app)
+    problems.describe(app, read_apart=[SpectraRequest])
     for module in (
         health, keys, acquisitions, files, uploads, jobs, clouds, zarr, spectra, previews, labels, exports,
     ):  # fmt: skip
         app.include_router(module.router)
+    # Within what answers browsers' questions and puts uploads right, before all that reads a body.
+    app.add_middleware(Gate)
     uploads.mount(app, context)
     if settings.cors_origins:
         app.add_middleware(
@@ -81,7 +86,6 @@ def create_app(settings: ServiceSettings) -> FastAPI:
             expose_headers=EXPOSED,
             max_age=600,
         )
-    app.add_middleware(JsonLimit)
     app.add_middleware(Observed, metrics=context.metrics)
     return app
 

@@ -1,14 +1,17 @@
-"""Judging of arrived files in child processes, so that a hostile file costs a child and not the service."""
+"""Judging of arrived files in child processes that reach that file alone: a hostile one costs a copy of a child, and
+neither the service nor any other file. What a child says is checked before it is believed."""
 
 from __future__ import annotations
 
 import json
 import os
 import selectors
+import signal
 import subprocess
 import sys
 import threading
 import time
+import uuid
 from collections.abc import Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import suppress
@@ -16,11 +19,14 @@ from pathlib import Path
 from typing import Any
 
 from specimap.core.errors import BackendUnavailableError
+from specimap.core.files import disk_errors, remove
 from specimap.infra.logs import logger
 from specimap.infra.settings import ServiceSettings
+from specimap.service.verdicts import checked_verdict
 
 CHILDREN = 2
 START_SECONDS = 60
+LARGEST_ANSWER = 1 << 20
 COMMAND = (sys.executable, "-m", "specimap.core.intake")
 PASSED_ON = ("PATH", "LANG", "LC_ALL", "LD_LIBRARY_PATH", "PYTHONPATH", "HOME", "VIRTUAL_ENV")
 """Environment of a child. It sees no key and no password."""
@@ -33,7 +39,10 @@ class Judge:
 
     def __init__(self, settings: ServiceSettings, command: Sequence[str] = COMMAND) -> None:
         self._settings = settings
-        self._command = (*command, str(settings.judge_memory_bytes), str(settings.max_cube_bytes))
+        self._command = (
+            *command, str(settings.judge_memory_bytes), str(settings.max_cube_bytes), settings.sandbox,
+            *map(str, settings.private_places),
+        )  # fmt: skip
         # Threads of its own: a child dies with the thread that started it, and the app's threads come and go.
         self._threads = ThreadPoolExecutor(CHILDREN, thread_name_prefix="judge")
         self._own = threading.local()
@@ -85,8 +94,17 @@ class Judge:
 
     def _ask(self, task: dict[str, Any]) -> Verdict:
         child = self._child()
+        scratch = self._settings.scratch / "judging" / f"{uuid.uuid4().hex}.tmp"
         try:
-            return child.ask(task, self._settings.judge_seconds)
+            with disk_errors(scratch):
+                scratch.mkdir(parents=True)
+            answer = child.ask({**task, "scratch": str(scratch)}, self._settings.judge_seconds)
+            try:
+                return checked_verdict(task["kind"], answer)
+            except ValueError:
+                # It ended without an answer, or with one that no reader gives. The child itself is not concerned.
+                logger().warning("judging ended without a verdict", kind=task["kind"], too_slow=False)
+                return _hostile(task["kind"], slow=False)
         except (TimeoutError, _GoneError) as error:
             self._drop(child)
             if self._closed:
@@ -94,6 +112,8 @@ class Judge:
             slow = isinstance(error, TimeoutError)
             logger().warning("judging ended without a verdict", kind=task["kind"], too_slow=slow)
             return _hostile(task["kind"], slow=slow)
+        finally:
+            remove(scratch)
 
     def _child(self) -> _Child:
         """That of the current thread."""
@@ -184,7 +204,7 @@ class _Child:
                 if not selector.select(max(0.0, deadline - time.monotonic())):
                     raise TimeoutError
                 piece = os.read(self._process.stdout.fileno(), 1 << 16)
-                if not piece:
+                if not piece or len(self._buffer) > LARGEST_ANSWER:
                     raise _GoneError
                 self._buffer += piece
         line, _, self._buffer = self._buffer.partition(b"\n")
@@ -195,8 +215,9 @@ class _Child:
         return answer
 
     def kill(self) -> None:
-        """End it."""
-        self._process.kill()
+        """End it, and the copy of it that judges a file."""
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
 
     def close(self) -> None:
         """End it, reap it and close its pipes."""

@@ -16,13 +16,17 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import parse_options_header
 
 from specimap.core.files import disk_errors, remove
-from specimap.infra.errors import ChecksumMismatchError, RequestInvalidError
+from specimap.infra.errors import ChecksumMismatchError, PayloadTooLargeError, RequestInvalidError
 from specimap.infra.models import ROLES
 
 if TYPE_CHECKING:
     from python_multipart.multipart import MultipartCallbacks
 
 LONGEST_FIELD = 256
+LONGEST_HEADER, MOST_HEADERS = 8192, 16
+"""Of one part."""
+MOST_BESIDE = 2 * 1024 * 1024
+"""Bytes of a form beside those of its files: boundaries, headers, fields, and what has come of the next."""
 BATCH = 1024 * 1024
 _SHA256 = re.compile(r"^[0-9a-fA-F]{64}$")
 
@@ -55,6 +59,7 @@ class _State:
     header_name: bytearray = field(default_factory=bytearray)
     header_value: bytearray = field(default_factory=bytearray)
     options: dict[bytes, bytes] = field(default_factory=dict)
+    headers: int = 0
     pending: list[tuple[str, bytes]] = field(default_factory=list)
 
 
@@ -88,14 +93,15 @@ class FormFiles:
             )
         try:
             parser = MultipartParser(options[b"boundary"], self._callbacks())
-            buffer = bytearray()
+            buffer, came = bytearray(), 0
             async for chunk in request.stream():
                 buffer += chunk
                 if len(buffer) >= BATCH:
-                    parser.write(bytes(buffer))
+                    came += len(buffer)
+                    # In a thread, since a form of thousands of tiny parts takes long to take apart.
+                    await asyncio.to_thread(self._feed, parser, bytes(buffer), came)
                     buffer.clear()
-                    await asyncio.to_thread(self._work_off)
-            parser.write(bytes(buffer))
+            await asyncio.to_thread(self._feed, parser, bytes(buffer), came + len(buffer))
             parser.finalize()
             await asyncio.to_thread(self._work_off)
         except FormParserError as error:
@@ -119,19 +125,28 @@ class FormFiles:
         state = self._state
 
         def begin() -> None:
-            state.options = {}
+            state.options, state.headers = {}, 0
 
         def header_field(data: bytes, start: int, end: int) -> None:
             state.header_name += data[start:end]
+            check_header()
 
         def header_value(data: bytes, start: int, end: int) -> None:
             state.header_value += data[start:end]
+            check_header()
+
+        def check_header() -> None:
+            if len(state.header_name) + len(state.header_value) > LONGEST_HEADER:
+                raise RequestInvalidError("A header of the form is too long.", advice="Send multipart/form-data.")
 
         def header_end() -> None:
             if bytes(state.header_name).lower() == b"content-disposition":
                 _, state.options = parse_options_header(bytes(state.header_value))
             state.header_name.clear()
             state.header_value.clear()
+            state.headers += 1
+            if state.headers > MOST_HEADERS:
+                raise RequestInvalidError("A part has too many headers.", advice="Send multipart/form-data.")
 
         def headers_finished() -> None:
             name = state.options.get(b"name", b"").decode("utf-8", "replace")
@@ -149,6 +164,14 @@ class FormFiles:
             "on_part_end": lambda: state.pending.append(("part end", b"")),
             "on_end": lambda: state.pending.append(("end", b"")),
         }  # fmt: skip
+
+    def _feed(self, parser: MultipartParser, data: bytes, came: int) -> None:
+        parser.write(data)
+        self._work_off()
+        if came - self._total > MOST_BESIDE:
+            raise PayloadTooLargeError(
+                "The form holds too much beside its files.", advice="Send `role` and `file`.", limit_bytes=MOST_BESIDE
+            )
 
     def _work_off(self) -> None:
         pending, self._state.pending = self._state.pending, []

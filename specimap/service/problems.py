@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
+from pydantic.json_schema import models_json_schema
 from starlette.exceptions import HTTPException
 
 from specimap.core.errors import NotFoundError, SpecimapError
@@ -99,12 +101,20 @@ def install(app: FastAPI) -> None:
         )
 
 
-def describe(app: FastAPI) -> None:
-    """Leave out of the app's description what HTTP itself speaks of: a server answers a wrong one before the app."""
+def describe(app: FastAPI, read_apart: Sequence[type[BaseModel]] = ()) -> None:
+    """Leave out of the app's description what HTTP itself speaks of: a server answers a wrong one before the app.
+
+    ``read_apart``: models of bodies that routes read themselves and only refer to.
+    """
     described = app.openapi
+    _, more = models_json_schema(
+        [(model, "validation") for model in read_apart], ref_template="#/components/schemas/{model}"
+    )
 
     def openapi() -> dict[str, Any]:
         contract = described()
+        schemas = contract["components"]["schemas"]
+        contract["components"]["schemas"] = dict(sorted((schemas | more.get("$defs", {})).items()))
         for operations in contract["paths"].values():
             for operation in operations.values():
                 given = operation.get("parameters", [])

@@ -73,14 +73,15 @@ class Select(_OneOf):
     """Which points: exactly one of these."""
 
     indices: list[_Number] | None = Field(
-        default=None, min_length=1, max_length=MOST_POINTS, description="Points by number, in this order."
+        default=None, min_length=1, max_length=MOST_POINTS, fail_fast=True,
+        description="Points by number, in this order.",
     )
     pixels: list[tuple[_Pixel, _Pixel]] | None = Field(
-        default=None, min_length=1, max_length=MOST_POINTS,
+        default=None, min_length=1, max_length=MOST_POINTS, fail_fast=True,
         description="Points by row and column of the cube, in this order; a pixel without a point is left out.",
     )  # fmt: skip
     polygon: list[tuple[_Coordinate, _Coordinate]] | None = Field(
-        default=None, min_length=3, max_length=MOST_VERTICES,
+        default=None, min_length=3, max_length=MOST_VERTICES, fail_fast=True,
         description="Points whose pixel's centre lies in the closed polygon of (row, column); even-odd rule.",
     )  # fmt: skip
     nearest: Nearest | None = None
@@ -95,7 +96,7 @@ class Bands(_OneOf):
         default=None, description="Bands from the first to the second wavelength, both included."
     )
     indices: list[_Number] | None = Field(
-        default=None, min_length=1, max_length=65536, description="Bands by number, in this order."
+        default=None, min_length=1, max_length=65536, fail_fast=True, description="Bands by number, in this order."
     )
 
 

@@ -7,6 +7,7 @@ import shlex
 import sys
 
 from specimap.core.errors import SpecimapError
+from specimap.core.sandbox import hide_from_others
 from specimap.infra.database import Database
 from specimap.infra.logs import logger, set_up_logs
 from specimap.infra.migrate import migrate
@@ -28,6 +29,7 @@ def main() -> int:
     try:
         settings = load_settings()
         set_up_logs(settings)
+        hide_from_others()
         database = Database.open(settings.database)
         migrate(database)
         database.close()

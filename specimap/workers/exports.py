@@ -19,8 +19,7 @@ import sqlalchemy as sa
 from specimap.core.cloud.schema import ARRAYS
 from specimap.core.errors import CancelledError, NotFoundError, SpecimapError
 from specimap.core.export.formats import FileFormat, file_name
-from specimap.core.files import disk_errors, remove
-from specimap.core.reconstruct.learned.environment import bare_environment
+from specimap.core.files import remove
 from specimap.infra.database import Database
 from specimap.infra.errors import DatabaseUnavailableError, StageTimeoutError, WorkerCrashedError
 from specimap.infra.labels import current_labels, fingerprint
@@ -28,6 +27,7 @@ from specimap.infra.logs import logger
 from specimap.infra.models import CloudRow, Export
 from specimap.infra.settings import ServiceSettings
 from specimap.infra.storage import Storage
+from specimap.workers.cells import Cell, Cells, is_plain
 from specimap.workers.export_main import REFUSED
 
 DOCUMENTS = (FileFormat.HTML, FileFormat.PDF)
@@ -56,16 +56,15 @@ def run_export(
     export = _claim(database, export_id, executor)
     if export is None:
         return
-    work = settings.scratch / f"{export_id}-{uuid4().hex[:8]}.tmp"
+    cells = Cells.of(settings, settings.scratch, "tmp")
+    cell = cells.new(f"{export_id}-{uuid4().hex[:8]}")
     try:
         format = FileFormat(export.format)
-        target = work / file_name(export.cloud_id, format)
-        with disk_errors(work):
-            work.mkdir(parents=True)
-        labels_hash = _fetch(database, storage, export.cloud_id, format, work)
-        _make(work, format, target, settings, lambda: _held(database, export_id, executor), cancelled)
+        target = cell.own / file_name(export.cloud_id, format)
+        labels_hash = _fetch(database, storage, export.cloud_id, format, cell.given)
+        _make(cells, cell, format, target, settings, lambda: _held(database, export_id, executor), cancelled)
         # Each attempt has a place of its own: one that lost the row cannot replace the file that the row names.
-        key, size = f"exports/{export_id}/{work.stem}/{target.name}", target.stat().st_size
+        key, size = f"exports/{export_id}/{cell.folder.stem}/{target.name}", target.stat().st_size
         storage.put_file(key, target)
         done = {"state": "succeeded", "storage_key": key, "size": size, "error": None, "labels_hash": labels_hash}
         if not _finish(database, export_id, executor, done):
@@ -81,10 +80,11 @@ def run_export(
         logger().error("export failed", export=export_id, code=failure.code, exc_info=error)
         described = failure.as_dict()
         # The path of a scratch folder says nothing to a client.
-        described["message"] = str(described["message"]).replace(f"{work}/", "")
+        for folder in (cell.own, cell.given, cell.folder):
+            described["message"] = str(described["message"]).replace(f"{folder}/", "")
         _finish(database, export_id, executor, {"state": "failed", "error": described})
     finally:
-        remove(work)
+        cell.remove()
 
 
 class _LostError(Exception):
@@ -158,7 +158,8 @@ def _fetch_drawn(storage: Storage, prefix: str, work: Path) -> None:
 
 
 def _make(
-    work: Path,
+    cells: Cells,
+    cell: Cell,
     format: FileFormat,
     target: Path,
     settings: ServiceSettings,
@@ -173,8 +174,8 @@ def _make(
     """
     status = 0
     for _ in range(settings.starts):
-        status, answer = _run_once(work, format, target, settings, held, cancelled)
-        if status == 0:
+        status, answer = _run_once(cells, cell, format, target, settings, held, cancelled)
+        if status == 0 and is_plain(cell.own):
             return
         if status == REFUSED:
             error = json.loads(answer)
@@ -197,7 +198,8 @@ class _RefusedError(SpecimapError):
 
 
 def _run_once(
-    work: Path,
+    cells: Cells,
+    cell: Cell,
     format: FileFormat,
     target: Path,
     settings: ServiceSettings,
@@ -205,13 +207,14 @@ def _run_once(
     cancelled: Callable[[], bool],
 ) -> tuple[int, str]:
     command = [
-        sys.executable, "-m", "specimap.workers.export_main", str(work), format.value, str(target), str(os.getpid()),
-        str(settings.stage_memory_bytes),
+        sys.executable, "-m", "specimap.workers.export_main", str(cell.given), format.value, str(target),
+        str(os.getpid()), str(settings.stage_memory_bytes),
     ]  # fmt: skip
     # A session of its own: a kill reaches whatever it starts, and the terminal's signals do not reach it.
     process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, text=True, start_new_session=True, env=bare_environment()
-    )
+        cells.confined(command, cell, backends=False), stdout=subprocess.PIPE, text=True, start_new_session=True,
+        env=cells.environment(cell),
+    )  # fmt: skip
     start = asked = time.monotonic()
     try:
         while True:

@@ -26,6 +26,7 @@ from specimap.infra.models import CloudRow, Job
 from specimap.infra.settings import ServiceSettings
 from specimap.infra.storage import Storage
 from specimap.workers.artefacts import SAVED, Artefacts
+from specimap.workers.cells import is_plain
 from specimap.workers.plan import Plan, plan_of
 from specimap.workers.processes import Processes, RefusedError, StageCrashedError, StageProcess
 
@@ -197,8 +198,6 @@ class JobRun:
         earlier = await self._thread(self._earlier, plan)
         spec = {
             "stage": stage,
-            "inputs": plan.inputs(self._inputs),
-            "out": str(self._out),
             "settings": plan.settings,
             "keys": plan.keys,
             "hashes": plan.hashes,
@@ -210,7 +209,12 @@ class JobRun:
             process = await self._processes.take()
             self._processes.prepare()
             try:
-                return await self._watch(process, spec, stage)
+                with process.cell.holding(self._inputs, self._out) as (inputs, out):
+                    places = {"inputs": plan.inputs(inputs), "out": str(out)}
+                    seconds = await self._watch(process, spec | places, stage)
+                if not await self._thread(is_plain, self._out):
+                    raise StageCrashedError("left something that is no file", [])
+                return seconds
             except StageCrashedError as crash:
                 for line in crash.tail:
                     logger().error("stage's last lines", job=self.job_id, stage=stage, line=line)
@@ -218,6 +222,8 @@ class JobRun:
                 await self._log("error", f"The process of stage {stage} {crash.reason}.", stage=stage, starts=starts)
                 if starts > self._settings.starts:
                     raise _poisoned(stage, starts - 1, "process", crash.reason) from crash
+            finally:
+                await process.end()
 
     async def _watch(self, process: StageProcess, spec: dict[str, Any], stage: str) -> float:
         told = 0.0

@@ -10,11 +10,13 @@ import sys
 from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 from specimap.core.errors import SpecimapError
-from specimap.core.reconstruct.learned.environment import BACKEND_VARIABLES, bare_environment
+from specimap.core.reconstruct.learned.environment import BACKEND_VARIABLES
 from specimap.infra.errors import StageTimeoutError
+from specimap.workers.cells import Cell, Cells
 
 COMMAND = (sys.executable, "-m", "specimap.workers.stage_main")
 LAST_LINES = 40
@@ -43,16 +45,18 @@ class RefusedError(Exception):
 class StageProcess:
     """One process, for one stage."""
 
-    def __init__(self, process: asyncio.subprocess.Process) -> None:
+    def __init__(self, process: asyncio.subprocess.Process, cell: Cell) -> None:
         self._process = process
+        self.cell = cell
         self._tail: deque[str] = deque(maxlen=LAST_LINES)
         self._reading = asyncio.create_task(self._read_errors())
 
     @classmethod
-    async def start(cls, command: Sequence[str]) -> StageProcess:
-        """Start it; it loads its libraries meanwhile."""
+    async def start(cls, command: Sequence[str], cells: Cells) -> StageProcess:
+        """Start it in a cell of its own; it loads its libraries meanwhile."""
+        cell = await asyncio.to_thread(cells.new)
         process = await asyncio.create_subprocess_exec(
-            *command,
+            *await asyncio.to_thread(partial(cells.confined, command, cell, backends=True)),
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
@@ -60,9 +64,9 @@ class StageProcess:
             # A group of its own: a kill reaches whatever it starts, and the terminal's signals do not reach it.
             start_new_session=True,
             # A process that reads uploads sees no password, and of our variables what tells of backends alone.
-            env=bare_environment(BACKEND_VARIABLES),
+            env=cells.environment(cell, tuple(BACKEND_VARIABLES)),
         )
-        return cls(process)
+        return cls(process, cell)
 
     @property
     def alive(self) -> bool:
@@ -116,6 +120,11 @@ class StageProcess:
         await self._process.wait()
         await self._reading
 
+    async def end(self) -> None:
+        """The same, and remove its cell."""
+        await self.kill()
+        await asyncio.to_thread(self.cell.remove)
+
     async def _read_errors(self) -> None:
         assert self._process.stderr is not None
         while True:
@@ -139,8 +148,9 @@ def _reason(code: int) -> str:
 class Processes:
     """Gives out processes and keeps some in reserve."""
 
-    def __init__(self, command: Sequence[str] = COMMAND, *, memory_bytes: int = 0) -> None:
+    def __init__(self, cells: Cells, command: Sequence[str] = COMMAND, *, memory_bytes: int = 0) -> None:
         self._command = (*command, str(memory_bytes), str(os.getpid()))
+        self._cells = cells
         self._spares: list[StageProcess] = []
         self._starting: asyncio.Task[None] | None = None
 
@@ -152,7 +162,8 @@ class Processes:
             spare = self._spares.pop(0)
             if spare.alive:
                 return spare
-        return await StageProcess.start(self._command)
+            await spare.end()
+        return await StageProcess.start(self._command, self._cells)
 
     def prepare(self) -> None:
         """Start processes for the next stages, until enough are there."""
@@ -161,7 +172,7 @@ class Processes:
 
     async def _prepare(self) -> None:
         while len(self._spares) < SPARES:
-            self._spares.append(await StageProcess.start(self._command))
+            self._spares.append(await StageProcess.start(self._command, self._cells))
 
     async def close(self) -> None:
         """End those in reserve."""
@@ -169,5 +180,5 @@ class Processes:
             with suppress(OSError, SpecimapError):
                 await self._starting
         for spare in self._spares:
-            await spare.kill()
+            await spare.end()
         self._spares.clear()

@@ -34,6 +34,7 @@ from specimap.infra.queue import (
 from specimap.infra.settings import ServiceSettings
 from specimap.infra.storage import Storage
 from specimap.infra.webhooks import deliver_due, webhook_client
+from specimap.workers.cells import Cells
 from specimap.workers.exports import run_export
 from specimap.workers.job import STAGES, JobRun
 from specimap.workers.leases import LeaseKeeper
@@ -54,10 +55,16 @@ class Worker:
         self.executor = f"{socket.gethostname()}:{slot}:{uuid.uuid4().hex[:12]}"
         self._database = Database.open(settings.database)
         self._storage = Storage.open(settings)
-        self._processes = Processes(command, memory_bytes=settings.stage_memory_bytes)
+        cells = Cells.of(settings, settings.scratch / "work", self._suffix)
+        self._processes = Processes(cells, command, memory_bytes=settings.stage_memory_bytes)
         self._kind = kind
         self._stopping = threading.Event()
         self._note: TextIO | None = None
+
+    @property
+    def _suffix(self) -> str:
+        """How the names of this executor's folders end."""
+        return self.executor.rsplit(":", 1)[-1]
 
     def run(self) -> None:
         """Work until SIGTERM or SIGINT; the database has been migrated.
@@ -179,7 +186,7 @@ class Worker:
         work = self.settings.scratch / "work"
         work.mkdir(parents=True, exist_ok=True, mode=0o700)
         if self._note is None:
-            self._note = open(work / f"{self.executor.rsplit(':', 1)[-1]}.lock", "w", encoding="ascii")  # noqa: SIM115
+            self._note = open(work / f"{self._suffix}.lock", "w", encoding="ascii")  # noqa: SIM115
             fcntl.flock(self._note, fcntl.LOCK_EX)
         for path in work.glob("*.lock"):
             with suppress(OSError), open(path, encoding="ascii") as note:

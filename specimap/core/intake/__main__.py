@@ -1,8 +1,11 @@
 """The process that looks into files from outside: one JSON line in, one out, until standard input ends.
 
-``python -m specimap.core.intake MEMORY_BYTES FILE_BYTES``: how much memory the judging of a file may take over what
-the process takes at rest, and how large a temporary file may become. A file that makes a decoder crash, hang or
-swallow memory costs this process, not the service; whoever started it stops it when it takes too long.
+``python -m specimap.core.intake MEMORY_BYTES FILE_BYTES [SANDBOX [PRIVATE…]]``: how much memory the judging of a file
+may take over what the process takes at rest, how large a temporary file may become, the setting of that name, and
+places that are never to be read. Each file is judged in a copy of the process (a fork) of its own, which can read that
+file's folder and write the task's ``scratch``, and ends with its answer: a file that takes a decoder over, makes it
+crash or swallow memory costs that copy, and neither the service nor the next file. Whoever started the process stops
+it when it takes too long.
 """
 
 from __future__ import annotations
@@ -13,19 +16,30 @@ import os
 import resource
 import signal
 import sys
+import tempfile
+import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from specimap.core.fiducials import detect_markers
 from specimap.core.intake.cube import judge_cube, judge_part
 from specimap.core.intake.photo import Others, judge_photo
 from specimap.core.intake.verdict import Verdict
+from specimap.core.sandbox import MODES, Confinement, Mode, Reach, program_rules
+from specimap.core.sandbox.landlock import READ, WRITE
+from specimap.core.sandbox.places import Rule
 
 PR_SET_PDEATHSIG = 1
+LARGEST_ANSWER = 256 * 1024
+MOST_OPEN = 128
+DIED: dict[str, Any] = {"died": True}
+"""The answer where a file's process ended without one."""
 
 
 def _photo(task: dict[str, Any]) -> Verdict:
@@ -49,32 +63,104 @@ def _address_space() -> int:
     return int(pages.read_text().split()[0]) * resource.getpagesize() if pages.exists() else 1 << 30
 
 
-def _limit_memory(most: int) -> None:
-    resource.setrlimit(resource.RLIMIT_AS, (most, resource.RLIM_INFINITY))
+def _end_with_parent() -> None:
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+
+
+class Copy:
+    """A copy of this process, for one file. It is made ahead, since copying takes as long as a small photo."""
+
+    def __init__(self, memory: int, rules: list[Rule], mode: Mode) -> None:
+        task, self._task = os.pipe()
+        self._answer, answer = os.pipe()
+        self.pid = os.fork()
+        if self.pid == 0:
+            try:
+                _judge_one(task, answer, memory, rules, mode)
+            except BaseException:
+                traceback.print_exc()
+                os._exit(1)
+            os._exit(0)
+        os.close(task)
+        os.close(answer)
+
+    def judge(self, line: str) -> bytes:
+        """Its answer to a task, one line each; :meth:`end` follows."""
+        with open(self._task, "wb", buffering=0) as pipe, suppress(BrokenPipeError):
+            pipe.write(line.encode())
+        said = b""
+        with open(self._answer, "rb", buffering=0) as pipe:
+            while b"\n" not in said and len(said) <= LARGEST_ANSWER and (piece := pipe.read(1 << 16)):
+                said += piece
+        # One line and no more: what follows would be taken for the next file's answer.
+        line_said, end, _ = said.partition(b"\n")
+        return line_said + end if end else json.dumps(DIED).encode() + b"\n"
+
+    def end(self) -> None:
+        """End it. That takes as long as making it: the answer is sent before."""
+        os.kill(self.pid, signal.SIGKILL)
+        os.waitpid(self.pid, 0)
+
+
+def _judge_one(reading: int, writing: int, memory: int, rules: list[Rule], mode: Mode) -> None:
+    _end_with_parent()
+    # The pipes to the service are not for this copy: it could read the next tasks, and answer them.
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for descriptor in (0, 1, 2):
+        os.dup2(nothing, descriptor)
+    for descriptor in _open_descriptors() - {0, 1, 2, reading, writing}:
+        os.close(descriptor)
+    confinement, at_rest = Confinement(rules, mode), _address_space()
+    with open(reading, encoding="utf-8") as pipe:
+        line = pipe.readline()
+    if not line:
+        return
+    task = json.loads(line)
+    folder, scratch = Path(task["path"]).parent, task["scratch"]
+    os.environ["TMPDIR"] = tempfile.tempdir = scratch
+    # Cubes are mapped, which takes addresses and no memory.
+    mapped = sum(f.stat().st_size for f in folder.iterdir()) if task["kind"] == "cube" else 0
+    for limit, most in ((resource.RLIMIT_AS, at_rest + memory + mapped), (resource.RLIMIT_NOFILE, MOST_OPEN)):
+        resource.setrlimit(limit, (most, most))
+    confinement.enter([(str(folder), READ), (scratch, WRITE)], alone=True)
+    answer = json.dumps(TASKS[task["kind"]](task).as_dict()).encode() + b"\n"
+    while answer:
+        answer = answer[os.write(writing, answer) :]
+
+
+def _open_descriptors() -> set[int]:
+    there = set()
+    for descriptor in range(256):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            continue
+        there.add(descriptor)
+    return there
 
 
 def main() -> None:
     """Judge files until there are no more."""
     memory, largest_file = int(sys.argv[1]), int(sys.argv[2])
-    if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    mode: Mode = sys.argv[3] if len(sys.argv) > 3 and sys.argv[3] in MODES else "best-effort"  # type: ignore[assignment]
+    _end_with_parent()
     # Libraries that print must not get between the lines.
-    out = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    out = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
     cv2.setNumThreads(1)
     detect_markers(np.zeros((64, 64), np.uint8), "DICT_4X4_50", expected=0)  # fills OpenCV's tables
-    at_rest = _address_space()
-    print(json.dumps({"ready": True}), file=out, flush=True)
+    Image.init()
+    rules = program_rules(Reach(keep_from=[Path(place) for place in sys.argv[4:]]))
+    copy = Copy(memory, rules, mode)
+    out.write(json.dumps({"ready": True}).encode() + b"\n")
     for line in sys.stdin:
-        task = json.loads(line)
-        # Cubes are mapped, which takes addresses and no memory.
-        mapped = sum(f.stat().st_size for f in Path(task["path"]).parent.iterdir()) if task["kind"] == "cube" else 0
-        _limit_memory(at_rest + memory + mapped)
-        verdict = TASKS[task["kind"]](task)
-        print(json.dumps(verdict.as_dict()), file=out, flush=True)
+        out.write(copy.judge(line))
+        copy.end()
+        copy = Copy(memory, rules, mode)
 
 
 if __name__ == "__main__":

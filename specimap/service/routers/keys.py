@@ -28,7 +28,7 @@ class KeyRequest(BaseModel):
     )
 
     name: str = Field(min_length=1, max_length=100, description="Whose key it is; no patient's name.")
-    scopes: list[Literal["upload", "read", "label", "admin"]] = Field(min_length=1)
+    scopes: list[Literal["upload", "read", "label", "admin"]] = Field(min_length=1, fail_fast=True)
     expires_at: Moment | None = None
     rate_per_minute: int | None = Field(default=None, ge=1, le=10_000_000)
     quota_bytes: int | None = Field(default=None, ge=1, le=2**60)

@@ -6,7 +6,7 @@ import json
 from typing import Annotated, Any
 
 import numpy as np
-from fastapi import APIRouter, Path, Query, Request
+from fastapi import APIRouter, Depends, Path, Query, Request
 from starlette.responses import Response
 
 from specimap.core.cloud import Cloud
@@ -14,6 +14,7 @@ from specimap.core.errors import NotFoundError
 from specimap.core.geometry import Array
 from specimap.service.answers import ARROW, JSON, NPY, arrow_answer, chosen_type, documented, json_answer, npy_answer
 from specimap.service.auth import Reader
+from specimap.service.bodies import parsed
 from specimap.service.clouds import CloudRecord
 from specimap.service.context import Context
 from specimap.service.ranges import CACHED, known_to_client
@@ -75,11 +76,26 @@ def show_point(
         )
 
 
+BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True, "content": {JSON: {"schema": {"$ref": "#/components/schemas/SpectraRequest"}}},
+    }
+}  # fmt: skip
+
+
+async def _wanted(request: Request) -> SpectraRequest:
+    return await parsed(request, SpectraRequest)
+
+
 @router.post(
-    "/clouds/{cloud_id}/spectra", response_model=SpectraAnswer, responses=documented(SpectraAnswer)
-)  # fmt: skip
+    "/clouds/{cloud_id}/spectra", response_model=SpectraAnswer, responses=documented(SpectraAnswer), openapi_extra=BODY
+)
 def read_spectra(
-    context: Context, principal: Reader, request: Request, cloud_id: CloudId, wanted: SpectraRequest
+    context: Context,
+    principal: Reader,
+    request: Request,
+    cloud_id: CloudId,
+    wanted: Annotated[SpectraRequest, Depends(_wanted)],
 ) -> Response:
     """Spectra of the points selected, a page at a time.
 

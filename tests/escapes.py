@@ -1,0 +1,166 @@
+"""Ways out of a process that has been taken over, each tried: what a hostile file would do if its reader obeyed it.
+
+Its text is run inside the process under test, so it imports nothing of ours. ``tried`` gives for each way ``out``
+where it leads out, else the error that stopped it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import socket
+import sqlite3
+import stat
+import struct
+import subprocess
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+LIBRARY = ctypes.CDLL(None, use_errno=True)
+PROCESS_VM_READV = 310 if os.uname().machine == "x86_64" else 270
+PIDFD_OPEN, IO_URING_SETUP, PTRACE_SEIZE = 434, 425, 0x4206
+
+
+def _called(answer: int) -> None:
+    if answer < 0:
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+
+
+def _bytes(path: str | Path) -> None:
+    with open(path, "rb") as file:
+        if not file.read(1):
+            raise OSError(0, "empty")
+
+
+def _in_thread(call: Callable[[], object]) -> None:
+    caught: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            call()
+        except BaseException as error:
+            caught.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    if caught:
+        raise caught[0]
+
+
+def _connected(family: int, kind: int, address: Any) -> None:
+    with socket.socket(family, kind) as end:
+        if kind == socket.SOCK_DGRAM:
+            end.sendto(b"x", address)
+        else:
+            end.connect(address)
+
+
+def _pair_turned(address: str) -> None:
+    one, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    with one, other:
+        one.sendto(b"x", address)
+
+
+def _bound() -> None:
+    with socket.socket() as end:
+        end.bind(("127.0.0.1", 0))
+        end.listen()
+
+
+def _block_device() -> None:
+    for path in Path("/dev").iterdir():
+        if stat.S_ISBLK(path.lstat().st_mode):
+            return _bytes(path)
+    raise OSError(0, "there is none")
+
+
+def _rows(database: str) -> None:
+    with sqlite3.connect(f"file:{database}?mode=ro", uri=True) as connection:
+        connection.execute("SELECT name FROM sqlite_master").fetchall()
+
+
+def _read_through_link(secret: str, own: Path) -> None:
+    os.link(secret, own / "hard")
+    _bytes(own / "hard")
+
+
+def _memory_of(pid: int) -> None:
+    buffer = ctypes.create_string_buffer(8)
+    here = struct.pack("PP", ctypes.addressof(buffer), 8)
+    there = struct.pack("PP", ctypes.addressof(buffer), 8)
+    _called(LIBRARY.syscall(PROCESS_VM_READV, pid, here, 1, there, 1, 0))
+
+
+def _limited(pid: int) -> None:
+    import resource
+
+    resource.prlimit(pid, resource.RLIMIT_CORE, (0, 0))
+
+
+def _ran(*command: str) -> None:
+    subprocess.run(command, check=True, capture_output=True, timeout=20)
+
+
+def ways(told: dict[str, Any]) -> dict[str, Callable[[], object]]:
+    """``told``: secret, elsewhere (a folder), database, parent (process id), tcp and udp (ports), unix (a socket's
+    path), abstract (its name), own (a folder to write), link (a symbolic link to the secret that the reader was given).
+    """
+    secret, elsewhere, parent = told["secret"], Path(told["elsewhere"]), told["parent"]
+    own = Path(told["own"])
+    stream, datagram = socket.SOCK_STREAM, socket.SOCK_DGRAM
+    return {
+        "read a file of the same user": lambda: _bytes(secret),
+        "read it by a relative path": lambda: _bytes(os.path.relpath(secret)),
+        "read it in another thread": lambda: _in_thread(lambda: _bytes(secret)),
+        "read it by /proc/self/root": lambda: _bytes(f"/proc/self/root{secret}"),
+        "read it by the parent's root": lambda: _bytes(f"/proc/{parent}/root{secret}"),
+        "read it by a symbolic link": lambda: _bytes(told["link"]),
+        "read it by a hard link": lambda: _read_through_link(secret, own),
+        "read it by another program": lambda: _ran("/bin/cat", secret),
+        "list its folder": lambda: os.listdir(elsewhere),
+        "read the database": lambda: _rows(told["database"]),
+        "read /etc/shadow": lambda: _bytes("/etc/shadow"),
+        "read a disk": _block_device,
+        "read the parent's environment": lambda: _bytes(f"/proc/{parent}/environ"),
+        "list the parent's open files": lambda: os.listdir(f"/proc/{parent}/fd"),
+        "open the parent's memory": lambda: os.close(os.open(f"/proc/{parent}/mem", os.O_RDONLY)),
+        "read the parent's memory": lambda: _memory_of(parent),
+        "trace the parent": lambda: _called(LIBRARY.ptrace(PTRACE_SEIZE, parent, None, None)),
+        "signal the parent": lambda: os.kill(parent, 0),
+        "get hold of the parent": lambda: _called(LIBRARY.syscall(PIDFD_OPEN, parent, 0)),
+        "limit the parent": lambda: _limited(parent),
+        "connect by TCP": lambda: _connected(socket.AF_INET, stream, ("127.0.0.1", told["tcp"])),
+        "send by UDP": lambda: _connected(socket.AF_INET, datagram, ("127.0.0.1", told["udp"])),
+        "connect to a UNIX socket": lambda: _connected(socket.AF_UNIX, stream, told["unix"]),
+        "connect to an abstract socket": lambda: _connected(socket.AF_UNIX, stream, told["abstract"]),
+        "turn a pair of sockets": lambda: _pair_turned(told["datagrams"]),
+        "listen": _bound,
+        "use io_uring": lambda: _called(LIBRARY.syscall(IO_URING_SETUP, 4, ctypes.create_string_buffer(248))),
+        "make a file elsewhere": lambda: (elsewhere / "made").write_text("x"),
+        "append to a file elsewhere": lambda: open(secret, "ab").close(),
+        "remove a file elsewhere": lambda: os.unlink(elsewhere / "spare"),
+        "rename a file to here": lambda: os.rename(elsewhere / "other", own / "other"),
+        "make a folder elsewhere": lambda: os.mkdir(elsewhere / "folder"),
+        "leave a symbolic link": lambda: os.symlink(secret, own / "soft"),
+        "leave a pipe": lambda: os.mkfifo(own / "pipe"),
+        "open a file to all": lambda: os.chmod(secret, 0o644),
+        "change a file's time": lambda: os.utime(secret, (1, 1)),
+        "change a file's owner": lambda: os.chown(secret, os.getuid(), os.getgid()),
+        "make a namespace": lambda: _called(LIBRARY.unshare(0x10000000)),
+    }  # fmt: skip
+
+
+def tried(told: dict[str, Any]) -> dict[str, str]:
+    """Try them all."""
+    found = {}
+    for name, way in ways(told).items():
+        try:
+            way()
+        except BaseException as error:
+            found[name] = f"{type(error).__name__}: {error}"
+        else:
+            found[name] = "out"
+    return found
