@@ -47,6 +47,12 @@ class PhotoUnreadableError(SpecimapError, ValueError):
     code = "photo_unreadable"
 
 
+class PhotoRawError(PhotoUnreadableError):
+    """A photo is a raw file: a sensor's readings, not a picture."""
+
+    code = "photo_raw"
+
+
 class TooFewPhotosError(SpecimapError, ValueError):
     """Fewer photos than the minimum, as given or after refusing some."""
 
@@ -229,6 +235,7 @@ HTTP_STATUS: dict[type[SpecimapError], int] = {
     NotFoundError: 404,
     OutputExistsError: 409,
     OutputNotWritableError: 500,
+    PhotoRawError: 422,
     PhotoUnreadableError: 422,
     PhotosNotConnectedError: 422,
     RegistrationError: 422,

@@ -45,6 +45,7 @@ REMARKS = {
     "dense_gpu_failed": "Nothing for this result. Have the worker's GPU looked at, or set it to use the CPU.",
     "backend_run": "Nothing: keep it with the result, so that it can be repeated.",
     "depth_unaligned": "Show two or more markers in the photos that are named, or run the default backend.",
+    "files_passed_over": "Nothing, where none of them is a photo of this specimen; else put it beside the others.",
     "licence_apache": "Nothing: the licence allows any use.",
     "licence_non_commercial": "Use this result for no commercial purpose; run the default backend for any other.",
 }
@@ -52,6 +53,7 @@ UNKNOWN_REMARK = "Read it before using the result; the documentation of errors a
 
 REFUSALS = {
     "photo_unreadable": "Copy the photo again, or take it again.",
+    "photo_raw": "Export it as JPEG, with the same settings as the others.",
     "photo_duplicate": "Nothing: the same photo is used once.",
     "photo_blurred": "Take it again from the same side: tap to focus, hold still.",
     "photo_foreign": "Leave it out if it shows something else; else show the markers in it.",
