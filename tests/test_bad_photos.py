@@ -219,16 +219,51 @@ def test_other_layouts_work(tmp_path: Path) -> None:
 # ---- scale ----------------------------------------------------------------------------------------------
 
 
-def test_a_wrong_edge_is_warned_of(small: OnDisk, tmp_path: Path) -> None:
-    photos = tmp_path / "photos"
-    photos.mkdir()
+@pytest.mark.parametrize(
+    ("edge", "named"),
+    [(0.3, "0.3 inches are 7.62 mm"), (0.268, "0.268 inches"), (0.68, "0.68 centimetres are 6.8 mm")],
+)
+def test_an_edge_in_another_unit_is_refused(
+    small: OnDisk, tmp_path: Path, edge: float, named: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The unit's own range is not what is asked for here.
+    from specimap.core import limits
+
+    monkeypatch.setitem(limits.RANGES, "edge_mm", (0.01, 1000.0))
+    refusal = run_refused(small.photos, small.header, tmp_path / "out", "--edge-mm", edge)
+    assert refusal["code"] == "edge_implausible"
+    assert named in str(refusal["advice"])
+    assert refusal["details"]["distance_mm"] == pytest.approx(150 * edge / 6.8, rel=0.1)  # type: ignore[index]
+
+
+def test_an_edge_far_too_large_is_refused(small: OnDisk, tmp_path: Path) -> None:
+    refusal = run_refused(small.photos, small.header, tmp_path / "out", "--edge-mm", 180)
+    assert refusal["code"] == "edge_implausible"
+    assert "4.0 m" in str(refusal["message"])
+
+
+def with_subject(photos: Path, folder: Path, metres: float) -> Path:
+    """Copies of photos whose EXIF states a distance."""
     from PIL import ExifTags, Image
 
-    for path in small.photos.iterdir():
+    folder.mkdir()
+    for path in photos.iterdir():
         with Image.open(path) as image:
             exif = Image.Exif()
-            exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.SubjectDistance] = 0.15
-            image.save(photos / path.name, quality=95, exif=exif)
+            exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.SubjectDistance] = metres
+            image.save(folder / path.name, quality=95, exif=exif)
+    return folder
+
+
+def test_an_edge_that_exif_and_reason_contradict_is_refused(small: OnDisk, tmp_path: Path) -> None:
+    photos = with_subject(small.photos, tmp_path / "photos", 0.15)
+    refusal = run_refused(photos, small.header, tmp_path / "out", "--edge-mm", 68)
+    assert refusal["code"] == "edge_implausible"
+    assert "EXIF says 150 mm" in str(refusal["message"])
+
+
+def test_a_doubtful_edge_is_warned_of(small: OnDisk, tmp_path: Path) -> None:
+    photos = with_subject(small.photos, tmp_path / "photos", 0.4)
     answer = specimap(
         "run", "--photos", photos, "--cube", small.header, "--out", tmp_path / "out", "--edge-mm", 68, "--json"
     )

@@ -110,6 +110,12 @@ class MarkerGeometryError(SpecimapError, ValueError):
     code = "marker_geometry_unsolvable"
 
 
+class EdgeImplausibleError(SpecimapError, ValueError):
+    """The marker edge puts the cameras where none can have been; ``details['distance_mm']`` says where."""
+
+    code = "edge_implausible"
+
+
 # ---- cube ---------------------------------------------------------------------------------------------
 
 
@@ -228,6 +234,7 @@ HTTP_STATUS: dict[type[SpecimapError], int] = {
     CubeTruncatedError: 422,
     DepthNotFoundError: 422,
     DuplicateMarkersError: 422,
+    EdgeImplausibleError: 422,
     LabelInvalidError: 422,
     MarkerGeometryError: 422,
     MarkersMissingInCubeError: 422,

@@ -25,6 +25,7 @@ from specimap.core.pipeline.artefacts import (
     save_stage2,
 )
 from specimap.core.pipeline.clock import Clock
+from specimap.core.pipeline.scale import check_scale
 from specimap.core.pipeline.settings import PipelineSettings
 from specimap.core.points import worth_refining
 from specimap.core.raycast import RayCaster
@@ -86,6 +87,9 @@ def reconstruct_stage(
         photos, corners, zooms = settle_breathing(
             photos, corners, edge_mm=settings.adjust.edge_mm, focal_px=stated_focal_px(photos), workers=workers
         )
+        if corners.solution is not None:
+            scene = corners.solution.scene
+            check_scale(scene.poses, scene.corners, settings, _subject_mm(photos))
         reconstruction = backend.reconstruct(
             photos,
             corners,
@@ -133,6 +137,7 @@ def adjust_stage(
         posed = seen.of(np.isin(seen.photo, r.photos))
         posed = replace(posed, photo=np.array([place[int(p)] for p in posed.photo]))
         adjusted = adjust(r.lens, r.poses, posed, stage1.corners.marker_ids, settings.adjust)
+        check_scale(adjusted.poses, adjusted.corners, settings, stage1.subject_mm)
         maps = tuple(replace(m, depth=m.depth * np.float32(adjusted.scale)) for m in r.maps)
         refined = mesh_of(
             maps, list(stage1.greys), adjusted.lens, adjusted.poses, adjusted.corners, settings,
