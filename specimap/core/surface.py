@@ -80,8 +80,8 @@ def fuse(
     mesh = grid.extract_triangle_mesh(settings.least_weight)
     if "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
         raise DepthNotFoundError(
-            "The photos gave no common surface.",
-            advice="Take sharper photos from 10-20 degrees apart, all around, with the specimen in the middle.",
+            f"{len(maps)} pairs of photos gave depth, but they agree on no surface.",
+            advice="Leave specimen and markers unmoved between photos, which are best 10 to 20 degrees apart.",
         )
     vertices = mesh.vertex.positions.numpy()
     triangles = mesh.triangle.indices.numpy().astype(np.int32)

@@ -161,7 +161,7 @@ def mesh_of(
     progress: Callable[[float], None] = lambda share: None,
 ) -> Refined:
     """Depth maps in mm to a mesh refined on the photos' ``greys``; all in the frame of ``poses`` and ``corners``."""
-    pixel_mm = pixel_footprint_mm(lens, poses, volume_over(corners).centre)
+    pixel_mm = pixel_footprint_mm(lens, poses, volume_over(corners, poses).centre)
     shrinkage = settings.reconstruct.depth.shrinkage(lens)
     voxel_mm = settings.surface.voxel_mm or VOXEL_PIXELS * pixel_mm / shrinkage
     fused = fuse(list(maps), poses, voxel_mm, settings.surface, progress=lambda s: progress(0.4 * s))
