@@ -88,10 +88,10 @@ def test_the_service_has_the_same_ranges() -> None:
     assert {getattr(m, "ge", None) or getattr(m, "le", None) for m in field.metadata} >= set(RANGES["edge_mm"])
     for edge in (0.03, 300, float("nan")):
         with pytest.raises(ValueError, match="edge_mm"):
-            AcquisitionRequest(specimen_id="S-1", edge_mm=edge)
+            AcquisitionRequest.model_validate({"specimen_id": "S-1", "edge_mm": edge})
         with pytest.raises(SettingsError):
             with_edge(edge).check()
     for edge in RANGES["edge_mm"]:
-        assert AcquisitionRequest(specimen_id="S-1", edge_mm=edge).edge_mm == edge
+        assert AcquisitionRequest.model_validate({"specimen_id": "S-1", "edge_mm": edge}).edge_mm == edge
         with_edge(edge).check()
     assert np.isfinite(list(RANGES.values())).all()

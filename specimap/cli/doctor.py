@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,6 +12,7 @@ from rich.table import Table
 
 from specimap.cli.progress import json_listener, progress_listener
 from specimap.cli.telling import FAILED, Debug, told
+from specimap.core.jsontext import json_text
 
 if TYPE_CHECKING:
     from specimap.core.reconstruct.learned.availability import Diagnosis, Usable
@@ -31,7 +31,7 @@ def doctor(
 
         found = diagnose()
         if json_events:
-            sys.stdout.write(json.dumps({"event": "diagnosed", **found.as_dict()}, default=str) + "\n")
+            sys.stdout.write(json_text({"event": "diagnosed", **found.as_dict()}) + "\n")
         else:
             print_diagnosis(found)
         fine = found.fine

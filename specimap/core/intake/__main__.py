@@ -24,6 +24,7 @@ from specimap.core.fiducials import detect_markers
 from specimap.core.intake.cube import judge_cube, judge_part
 from specimap.core.intake.photo import Others, judge_photo
 from specimap.core.intake.verdict import Verdict
+from specimap.core.jsontext import json_text
 
 PR_SET_PDEATHSIG = 1
 
@@ -67,14 +68,14 @@ def main() -> None:
     cv2.setNumThreads(1)
     detect_markers(np.zeros((64, 64), np.uint8), "DICT_4X4_50", expected=0)  # fills OpenCV's tables
     at_rest = _address_space()
-    print(json.dumps({"ready": True}), file=out, flush=True)
+    print(json_text({"ready": True}), file=out, flush=True)
     for line in sys.stdin:
         task = json.loads(line)
         # Cubes are mapped, which takes addresses and no memory.
         mapped = sum(f.stat().st_size for f in Path(task["path"]).parent.iterdir()) if task["kind"] == "cube" else 0
         _limit_memory(at_rest + memory + mapped)
         verdict = TASKS[task["kind"]](task)
-        print(json.dumps(verdict.as_dict()), file=out, flush=True)
+        print(json_text(verdict.as_dict()), file=out, flush=True)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import json
 from collections.abc import Callable
 from dataclasses import asdict, replace
 
@@ -18,6 +17,7 @@ from specimap.core.cloud.writer import write_cloud
 from specimap.core.cube import Cube
 from specimap.core.files import write_text
 from specimap.core.geometry import Floats, Pose, View
+from specimap.core.jsontext import json_text
 from specimap.core.layout import edge_lengths
 from specimap.core.meshfile import write_mesh_ply
 from specimap.core.pipeline.artefacts import Stage1, Stage2
@@ -79,7 +79,7 @@ def register_and_write(
         with staged(outputs) as aside:
             write_mesh_ply(aside.mesh, mesh)
             named = zip(adjusted.marker_ids, adjusted.corners, strict=True)
-            write_text(aside.corners, json.dumps({str(i): np.round(c, 6).tolist() for i, c in named}, indent=1))
+            write_text(aside.corners, json_text({str(i): np.round(c, 6).tolist() for i, c in named}, indent=1))
             write_cloud(
                 aside.cloud,
                 points,
