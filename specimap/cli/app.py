@@ -17,6 +17,7 @@ from specimap.cli.progress import Listener, json_listener, progress_listener
 from specimap.cli.report import report
 from specimap.cli.telling import Debug, stoppable, told
 from specimap.core.jsontext import json_text
+from specimap.core.photoformats import NAMES
 
 app = typer.Typer(
     add_completion=False,
@@ -77,7 +78,7 @@ class Kind(StrEnum):
 
 @app.command()
 def run(
-    photos: Annotated[Path, typer.Option(help="Folder of the photos (JPEG, PNG, TIFF, HEIC).")],
+    photos: Annotated[Path, typer.Option(help=f"Folder of the photos: {NAMES}.")],
     cube: Annotated[Path, typer.Option(help="The cube: an ENVI header, .npy, .npz, HDF5, NetCDF, MATLAB or TIFF.")],
     out: Annotated[Path, typer.Option(help="Folder for the results; an earlier run's is continued.")],
     white: Annotated[Path | None, typer.Option(help="White reference of the cube, for reflectance.")] = None,

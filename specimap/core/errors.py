@@ -155,6 +155,12 @@ class RegistrationError(SpecimapError, ValueError):
     code = "registration_failed"
 
 
+class ResultInsufficientError(SpecimapError, ValueError):
+    """Hardly a pixel between the markers got a place: the result would be of no use; details hold the figures."""
+
+    code = "result_insufficient"
+
+
 # ---- cloud --------------------------------------------------------------------------------------------
 
 
@@ -246,6 +252,7 @@ HTTP_STATUS: dict[type[SpecimapError], int] = {
     PhotoUnreadableError: 422,
     PhotosNotConnectedError: 422,
     RegistrationError: 422,
+    ResultInsufficientError: 422,
     SettingsError: 422,
     StorageFullError: 507,
     TooFewPhotosError: 422,

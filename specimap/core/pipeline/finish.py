@@ -16,6 +16,7 @@ from specimap.core.cloud import Cloud, CloudPoints, Flag
 from specimap.core.cloud.writer import write_cloud
 from specimap.core.cube import Cube
 from specimap.core.files import write_text
+from specimap.core.gates import gated
 from specimap.core.geometry import Floats, Pose, View
 from specimap.core.jsontext import json_text
 from specimap.core.layout import edge_lengths
@@ -76,6 +77,7 @@ def register_and_write(
         points, report = _register(
             stage1, stage2, cube, settings, caster, grids, remarks, inputs, clock, progress
         )
+        report = gated(report, settings.adjust.edge_mm)
         with staged(outputs) as aside:
             write_mesh_ply(aside.mesh, mesh)
             named = zip(adjusted.marker_ids, adjusted.corners, strict=True)

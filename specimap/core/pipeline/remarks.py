@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from specimap.core.acquisition import RECOMMENDED_PHOTOS
 from specimap.core.adjust import Adjusted
+from specimap.core.layout import edge_lengths
 from specimap.core.pipeline.artefacts import Stage1
-from specimap.core.pipeline.scale import PLAUSIBLE_DISTANCE_MM, disagrees, reach_mm
+from specimap.core.pipeline.scale import PLAUSIBLE_DISTANCE_MM, disagrees, likely_unit, reach_mm
 from specimap.core.register.cube_markers import CubeMarkers
 
 
@@ -28,8 +29,10 @@ def remarks_of(stage1: Stage1, adjusted: Adjusted, found: CubeMarkers) -> list[t
     reach = reach_mm(adjusted.poses, adjusted.corners)
     if not PLAUSIBLE_DISTANCE_MM[0] < reach < PLAUSIBLE_DISTANCE_MM[1]:
         remarks.append(
-            ("scale_implausible", f"With this marker edge the photos were taken {reach:.0f} mm from the markers.")
-        )
+            ("scale_implausible",
+             f"With this marker edge the photos were taken {reach:.0f} mm from the markers"
+             f"{likely_unit(edge_lengths(adjusted.corners).mean(), reach)}.")
+        )  # fmt: skip
     if disagrees(reach, stage1.subject_mm):
         remarks.append(
             ("scale_contradicts_exif",

@@ -62,7 +62,7 @@ def _check_edge(reach: float, edge_mm: float, subject_mm: float | None) -> None:
     beside = f", and EXIF says {subject_mm:.0f} mm" if contradicted else ""
     raise EdgeImplausibleError(
         f"With a marker edge of {edge_mm:g} mm the photos were taken from {_length(reach)}{beside}: the edge is wrong.",
-        advice=f"Measure the black edge of a printed marker and give it in millimetres{_guess(edge_mm, reach)}.",
+        advice=f"Measure the black edge of a printed marker and give it in millimetres{likely_unit(edge_mm, reach)}.",
         edge_mm=edge_mm,
         distance_mm=round(reach, 3),
     )
@@ -73,8 +73,8 @@ def disagrees(reach: float, subject_mm: float | None, ratio: float = SUBJECT_DIS
     return subject_mm is not None and not 1 / ratio < reach / subject_mm < ratio
 
 
-def _guess(edge_mm: float, reach: float) -> str:
-    """The units that would put the photos at a usual distance."""
+def likely_unit(edge_mm: float, reach: float) -> str:
+    """The units that would put the photos at a usual distance, as the end of a sentence; '' where none does."""
     fitting = [
         (unit, factor) for unit, factor in OTHER_UNITS.items()
         if USUAL_DISTANCE_MM[0] <= reach * factor <= USUAL_DISTANCE_MM[1]
