@@ -74,7 +74,7 @@ def budget(folder: Path, scratch: Path) -> Iterator[Part]:
     images = [p.image for p in read_photos(paths, settings.acquisition, workers=workers)[0]]
     lens, poses, corners = scene.true_photos()
     maps = dense_depth(
-        [images[p] for p in stage1.reconstruction.photos], lens, poses, volume_over(corners),
+        [images[p] for p in stage1.reconstruction.photos], lens, poses, volume_over(corners, poses),
         settings.reconstruct.depth, workers=workers,
     )  # fmt: skip
     redone = mesh_of(tuple(maps), list(stage1.greys), lens, poses, corners, settings, workers=workers).mesh

@@ -5,7 +5,6 @@ Photos and a cube: a whole run. ``--run`` and a cube: stages 3 and 4. Photos alo
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import time
@@ -17,6 +16,7 @@ from pathlib import Path
 from bench.tracing import tracing
 from specimap.core.acquisition import photo_paths
 from specimap.core.cube import open_cube
+from specimap.core.jsontext import json_text
 from specimap.core.pipeline import Inputs, Outputs, run_pipeline
 from specimap.core.pipeline.artefacts import load_stage1, load_stage2
 from specimap.core.pipeline.clock import Clock
@@ -41,7 +41,7 @@ class _Steps:
 
     @staticmethod
     def say(**event: object) -> None:
-        sys.stdout.write(json.dumps({"cpu": time.process_time(), **event}) + "\n")
+        sys.stdout.write(json_text({"cpu": time.process_time(), **event}) + "\n")
         sys.stdout.flush()
 
 

@@ -149,7 +149,7 @@ def _run(
 
 def _surface_mm(photos: list[Photo], posed: Posed, to_truth: Pose, truth: Truth) -> float:
     """Median difference of the surfaces' heights over the specimen; not a number where nothing was fused."""
-    volume = volume_over(posed.corners)
+    volume = volume_over(posed.corners, posed.poses)
     images = [photos[p].image for p in posed.photos]
     maps = dense_depth(images, posed.lens, posed.poses, volume, DepthSettings(), workers=WORKERS)
     try:

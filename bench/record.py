@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import datetime
-import json
 from pathlib import Path
 
 from bench.machine import describe
 from specimap.core.files import write_text
+from specimap.core.jsontext import json_text
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -17,5 +17,5 @@ def keep(part: str, figures: object, machine: dict[str, object] | None = None) -
     now = datetime.datetime.now(datetime.UTC)
     path = RESULTS / f"{now:%Y%m%dT%H%M%SZ}-{part}.json"
     document = {"part": part, "time": now.isoformat(timespec="seconds"), "machine": machine or describe()}
-    write_text(path, json.dumps(document | {"figures": figures}, indent=1))
+    write_text(path, json_text(document | {"figures": figures}, indent=1))
     return path

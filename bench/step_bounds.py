@@ -7,7 +7,6 @@ them. Said as JSON on standard output: seconds of wall and CPU time, by step.
 from __future__ import annotations
 
 import itertools
-import json
 import os
 import sys
 import tempfile
@@ -31,6 +30,7 @@ from bench.child import parsed, settings_of
 from specimap.core.acquisition import photo_paths
 from specimap.core.cloud import Cloud
 from specimap.core.cube import open_cube
+from specimap.core.jsontext import json_text
 from specimap.core.native import open3d
 from specimap.core.pipeline import stages
 from specimap.core.pipeline.clock import Clock
@@ -241,7 +241,7 @@ def main() -> None:
         stored = Cloud.open(outputs.cloud).stored_spectra(slice(None))
         (raw,) = (p for p in open_cube(options.cube).files if p != options.cube)
         found["cloud written"] = fastest(lambda: bound_seconds(raw, stored, scratch))
-    sys.stdout.write(json.dumps(found) + "\n")
+    sys.stdout.write(json_text(found) + "\n")
 
 
 if __name__ == "__main__":

@@ -10,6 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from broken_sets import copied, image_of
+from PIL import ExifTags, Image
 from scenes import SMALL, OnDisk, phantom_on_disk, read_corners, run_refused, specimap
 from test_acquisition import bomb
 
@@ -17,15 +19,6 @@ from specimap.core.accuracy import compare_with_truth
 from specimap.core.cloud import Cloud
 from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline
 from specimap.core.report import Report
-
-
-def copied(photos: Path, folder: Path, *, stem: str = "", step: int = 1) -> Path:
-    """Copy every ``step``-th photo, its name led by ``stem``."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for path in sorted(photos.iterdir())[::step]:
-        shutil.copy(path, folder / f"{stem}{path.name}")
-    return folder
-
 
 # ---- photos ---------------------------------------------------------------------------------------------
 
@@ -168,6 +161,39 @@ def test_photos_held_both_ways_are_all_used(small: OnDisk, shallow: Pose, tmp_pa
     assert shallow(photos, small) == {}
 
 
+def test_photos_of_every_format_and_turn_are_used(small: OnDisk, shallow: Pose, tmp_path: Path) -> None:
+    """A folder as several programs leave it: each photo in a format of its own, turned as EXIF says."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    kinds = [(".jpg", 1), (".tif", 6), (".heic", 8), (".webp", 3), (".avif", 6), (".png", 8), (".TIFF", 8), (".HIF", 6)]
+    back = {1: 0, 3: 2, 6: 1, 8: 3}
+    for k, path in enumerate(sorted(small.photos.iterdir())):
+        suffix, orientation = kinds[k % len(kinds)]
+        cut = image_of(path)[24:360, :, ::-1]  # 336 x 384
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = orientation
+        stored = Image.fromarray(np.ascontiguousarray(np.rot90(cut, back[orientation])))
+        lossy = {} if suffix.lower() in (".tif", ".tiff", ".png") else {"quality": 95}
+        kind = {".hif": "HEIF", ".tiff": "TIFF"}.get(suffix.lower())
+        # Under its own name, so that the truth is found.
+        stored.save(folder / f"{path.name}{suffix}", kind, exif=exif.tobytes(), **lossy)
+    names = [f"{name}{kinds[k % len(kinds)][0]}" for k, name in enumerate(small.truth.photo_names)]
+    named = replace(small.truth, photo_names=names)
+    assert shallow(folder, OnDisk(small.folder, named)) == {}
+
+
+def test_two_resolutions_of_one_phone_are_all_used(small: OnDisk, shallow: Pose, tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for k, path in enumerate(sorted(small.photos.iterdir())):
+        exif = Image.Exif()
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = 60
+        with Image.open(path) as image:
+            size = (288, 288) if k % 2 else image.size
+            image.resize(size, Image.Resampling.BOX).save(folder / path.name, quality=95, exif=exif)
+    assert shallow(folder, small) == {}
+
+
 # ---- markers --------------------------------------------------------------------------------------------
 
 
@@ -219,16 +245,49 @@ def test_other_layouts_work(tmp_path: Path) -> None:
 # ---- scale ----------------------------------------------------------------------------------------------
 
 
-def test_a_wrong_edge_is_warned_of(small: OnDisk, tmp_path: Path) -> None:
-    photos = tmp_path / "photos"
-    photos.mkdir()
-    from PIL import ExifTags, Image
+@pytest.mark.parametrize(
+    ("edge", "named"),
+    [(0.3, "0.3 inches are 7.62 mm"), (0.268, "0.268 inches"), (0.68, "0.68 centimetres are 6.8 mm")],
+)
+def test_an_edge_in_another_unit_is_refused(
+    small: OnDisk, tmp_path: Path, edge: float, named: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The unit's own range is not what is asked for here.
+    from specimap.core import limits
 
-    for path in small.photos.iterdir():
+    monkeypatch.setitem(limits.RANGES, "edge_mm", (0.01, 1000.0))
+    refusal = run_refused(small.photos, small.header, tmp_path / "out", "--edge-mm", edge)
+    assert refusal["code"] == "edge_implausible"
+    assert named in str(refusal["advice"])
+    assert refusal["details"]["distance_mm"] == pytest.approx(150 * edge / 6.8, rel=0.1)  # type: ignore[index]
+
+
+def test_an_edge_far_too_large_is_refused(small: OnDisk, tmp_path: Path) -> None:
+    refusal = run_refused(small.photos, small.header, tmp_path / "out", "--edge-mm", 180)
+    assert refusal["code"] == "edge_implausible"
+    assert "4.0 m" in str(refusal["message"])
+
+
+def with_subject(photos: Path, folder: Path, metres: float) -> Path:
+    """Copies of photos whose EXIF states a distance."""
+    folder.mkdir()
+    for path in photos.iterdir():
         with Image.open(path) as image:
             exif = Image.Exif()
-            exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.SubjectDistance] = 0.15
-            image.save(photos / path.name, quality=95, exif=exif)
+            exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.SubjectDistance] = metres
+            image.save(folder / path.name, quality=95, exif=exif)
+    return folder
+
+
+def test_an_edge_that_exif_and_reason_contradict_is_refused(small: OnDisk, tmp_path: Path) -> None:
+    photos = with_subject(small.photos, tmp_path / "photos", 0.15)
+    refusal = run_refused(photos, small.header, tmp_path / "out", "--edge-mm", 68)
+    assert refusal["code"] == "edge_implausible"
+    assert "EXIF says 150 mm" in str(refusal["message"])
+
+
+def test_a_doubtful_edge_is_warned_of(small: OnDisk, tmp_path: Path) -> None:
+    photos = with_subject(small.photos, tmp_path / "photos", 0.4)
     answer = specimap(
         "run", "--photos", photos, "--cube", small.header, "--out", tmp_path / "out", "--edge-mm", 68, "--json"
     )

@@ -47,7 +47,7 @@ def test_verdicts() -> None:
     )
     said = verdict(bad)
     assert said.level == "attention"
-    assert "4 of 4 checks failed" in said.title
+    assert "4 of 6 checks failed" in said.title
     assert "3 of 6 photos were not used (3 blurred)." in said.sentences
     assert "0.jpg, 1.jpg, 2.jpg" in said.actions[0]
     assert "marker 2, 3 in view" in said.actions[1]

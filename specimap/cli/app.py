@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from enum import StrEnum
 from pathlib import Path
@@ -17,6 +16,8 @@ from specimap.cli.keys import keys_app
 from specimap.cli.progress import Listener, json_listener, progress_listener
 from specimap.cli.report import report
 from specimap.cli.telling import Debug, stoppable, told
+from specimap.core.jsontext import json_text
+from specimap.core.photoformats import NAMES
 
 app = typer.Typer(
     add_completion=False,
@@ -77,7 +78,7 @@ class Kind(StrEnum):
 
 @app.command()
 def run(
-    photos: Annotated[Path, typer.Option(help="Folder of the photos (JPEG, PNG, TIFF, HEIC).")],
+    photos: Annotated[Path, typer.Option(help=f"Folder of the photos: {NAMES}.")],
     cube: Annotated[
         Path,
         typer.Option(
@@ -140,7 +141,7 @@ def info(
 
         report = read_report(out)
         if json_events:
-            sys.stdout.write((out / "report.json").read_text(encoding="utf-8") + "\n")
+            sys.stdout.write(report.text() + "\n")
         else:
             print_report(report)
 
@@ -163,7 +164,7 @@ def export(
         stem = "report" if format in (Format.html, Format.pdf) else "cloud"
         written = export_cloud(cloud, target or out / f"{stem}.{suffix}", format.value)
         if json_events:
-            sys.stdout.write(json.dumps({"event": "exported", "path": str(written)}) + "\n")
+            sys.stdout.write(json_text({"event": "exported", "path": str(written)}) + "\n")
         else:
             typer.echo(f"Wrote {written}")
 

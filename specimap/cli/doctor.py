@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,6 +13,7 @@ from rich.table import Table
 
 from specimap.cli.progress import json_listener, progress_listener
 from specimap.cli.telling import FAILED, Debug, told
+from specimap.core.jsontext import json_text
 
 if TYPE_CHECKING:
     from specimap.core.reconstruct.learned.availability import Diagnosis, Usable
@@ -35,8 +35,7 @@ def doctor(
         found, shield = diagnose(), protection()
         if json_events:
             confinement = {**asdict(shield), "whole": shield.whole}
-            told_all = {"event": "diagnosed", **found.as_dict(), "sandbox": confinement}
-            sys.stdout.write(json.dumps(told_all, default=str) + "\n")
+            sys.stdout.write(json_text({"event": "diagnosed", **found.as_dict(), "sandbox": confinement}) + "\n")
         else:
             print_diagnosis(found)
             Console().print(_shield_words(shield), highlight=False, soft_wrap=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,6 +13,7 @@ from rich.markup import escape
 from specimap.cli.progress import Listener, json_listener, progress_listener
 from specimap.cli.telling import Debug, stoppable, told
 from specimap.core.errors import SettingsError
+from specimap.core.jsontext import json_text
 
 if TYPE_CHECKING:
     from specimap.core.evidence.tables import Table
@@ -127,7 +127,7 @@ def _numbers(text: str, setting: str) -> tuple[int, ...]:
 
 
 def _say(**event: object) -> None:
-    sys.stdout.write(json.dumps(event) + "\n")
+    sys.stdout.write(json_text(event) + "\n")
     sys.stdout.flush()
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +15,7 @@ from rich.table import Table
 
 from specimap.cli.telling import REFUSED
 from specimap.core.errors import NotFoundError, SettingsError, SpecimapError
+from specimap.core.jsontext import json_text
 
 if TYPE_CHECKING:
     from sqlalchemy.orm import Session
@@ -81,7 +81,7 @@ def list_keys(as_json: Annotated[bool, typer.Option("--json", help="One JSON lin
             times = {name: getattr(row, name) for name in ("created_at", "last_used_at", "expires_at", "revoked_at")}
             told = {name: value.isoformat() if value else None for name, value in times.items()}
             line = {"id": row.id, "name": row.name, "scopes": row.scopes, "state": ended, **told}
-            sys.stdout.write(json.dumps(line) + "\n")
+            sys.stdout.write(json_text(line) + "\n")
             continue
         used = row.last_used_at.isoformat(" ", "minutes") if row.last_used_at else "never"
         table.add_row(row.id, row.name, " ".join(row.scopes), row.created_at.isoformat(" ", "minutes"), used, ended)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol, Self
@@ -13,6 +12,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TaskID, TextColum
 
 from specimap.cli.tables import print_report
 from specimap.core.errors import SpecimapError
+from specimap.core.jsontext import json_text
 from specimap.core.report import Report
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ class _Lines:
         return None
 
     def _say(self, **event: object) -> None:
-        sys.stdout.write(json.dumps(event, default=str) + "\n")
+        sys.stdout.write(json_text(event) + "\n")
         sys.stdout.flush()
 
     def progress(self, stage: str, share: float) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from enum import StrEnum
 from pathlib import Path
@@ -12,6 +11,7 @@ import typer
 
 from specimap.cli.progress import json_listener, progress_listener
 from specimap.cli.telling import Debug, told
+from specimap.core.jsontext import json_text
 
 
 class DocumentFormat(StrEnum):
@@ -37,6 +37,6 @@ def report(
 
         written = write_document(out, target or out / f"report.{format.value}", format.value, truth=truth)
         if json_events:
-            sys.stdout.write(json.dumps({"event": "reported", "path": str(written)}) + "\n")
+            sys.stdout.write(json_text({"event": "reported", "path": str(written)}) + "\n")
         else:
             typer.echo(f"Wrote {written}")

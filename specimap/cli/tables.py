@@ -40,6 +40,7 @@ def print_report(report: Report) -> None:
     rows.add_row(
         "corners in photos, RMS px", f"{report.reprojection_px.before:.3f} -> {report.reprojection_px.after:.3f}"
     )
+    rows.add_row("corners in cube, RMS px", f"{report.cube_camera.reprojection_rms_px:.3f}")
     rows.add_row("stated sigma of specimen, mm", f"{report.sigma_mm.median:.3f} (95 %: {report.sigma_mm.p95:.3f})")
     rows.add_row(
         "parallax that homography leaves, mm",

@@ -2,36 +2,30 @@
 
 from __future__ import annotations
 
-import hashlib
-import io
 import math
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
-from pillow_heif import register_heif_opener
 
-from specimap.core.errors import NotFoundError, PhotoUnreadableError, TooFewPhotosError
+from specimap.core.errors import PhotoRawError, PhotoUnreadableError, TooFewPhotosError
+from specimap.core.photofile import CameraStated, decode_photo
+from specimap.core.photofolder import photo_folder
+from specimap.core.photofolder import photo_paths as photo_paths
 
-register_heif_opener()
-
-PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".heic", ".heif"})
-PHOTO_FORMATS = ("JPEG", "PNG", "TIFF", "HEIF")
-"""Whatever a file is called, Pillow's other parsers (PostScript among them) do not get to see it."""
-LARGEST_PHOTO_PIXELS = 250_000_000
-# Pillow's own limit warns at 90 million pixels, which phones exceed, and on standard error; photos are judged by
-# the limit above before they are decoded.
-Image.MAX_IMAGE_PIXELS = None
-QUARTER_TURNS = {3: 2, 4: 2, 5: 1, 6: 1, 7: 3, 8: 3}
-"""Clockwise quarter turns by which an EXIF orientation is turned upright."""
 RECOMMENDED_PHOTOS = 20
 FULL_FRAME_DIAGONAL_MM = math.hypot(36, 24)
+LEAST_SIDE_PX = 32
+"""Of the shorter side at working size."""
+SAME_ASPECT = 0.004
+"""Relative difference up to which two sizes have one shape: three pixels of a photo that was reduced."""
+MOST_ENLARGED = 2.0
+"""A photo that must be enlarged more than this to match the others' working size blurs what they show."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +43,8 @@ class Photo:
     ``image`` (H, W, 3) sRGB uint8 at working size; ``full_size`` (width, height) upright pixels of the file;
     ``focal_px`` from EXIF in working pixels, None where there is none; ``subject_mm`` distance stated by EXIF;
     ``sharpness``: variance of the Laplacian over the variance of the image; ``digest``: sha256 of the file;
-    ``quarter_turns``: by how many, clockwise, the pixels were turned from how the sensor read them.
+    ``quarter_turns``: by how many, clockwise, the pixels were turned from how the sensor read them; ``camera``: what
+    EXIF says of it.
     """
 
     name: str
@@ -60,6 +55,7 @@ class Photo:
     sharpness: float
     digest: str
     quarter_turns: int = 0
+    camera: CameraStated = field(default_factory=CameraStated)
 
     def turned(self, quarter_turns: int) -> Photo:
         """The photo turned clockwise in its plane."""
@@ -70,6 +66,15 @@ class Photo:
             full_size=(height, width) if quarter_turns % 2 else (width, height),
             quarter_turns=(self.quarter_turns + quarter_turns) % 4,
         )
+
+    def at_size(self, size: tuple[int, int]) -> Photo:
+        """The photo at another working size (width, height) of the same shape."""
+        if size == self.size:
+            return self
+        shrunk = size[0] < self.size[0]
+        image = cv2.resize(self.image, size, interpolation=cv2.INTER_AREA if shrunk else cv2.INTER_CUBIC)
+        focal = self.focal_px and self.focal_px * math.hypot(*size) / math.hypot(*self.size)
+        return replace(self, image=np.asarray(image, np.uint8), focal_px=focal)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -97,106 +102,32 @@ class Refusal:
     reason: str
 
 
-def photo_paths(folder: Path) -> list[Path]:
-    """The photos in a folder by name; hidden files and other kinds of files are passed over.
-
-    Raises:
-        NotFoundError: there is no such folder.
-        TooFewPhotosError: it holds no photo.
-    """
-    if not folder.is_dir():
-        raise NotFoundError(f"There is no folder {folder}.", advice="Name the folder that holds the photos.")
-    paths = sorted(
-        p for p in folder.iterdir()
-        if p.is_file() and p.suffix.lower() in PHOTO_SUFFIXES and not p.name.startswith(".")
-    )  # fmt: skip
-    if not paths:
-        raise TooFewPhotosError(
-            f"{folder} holds no photo.",
-            advice=f"Photos end in {', '.join(sorted(PHOTO_SUFFIXES))}.",
-            found=0,
-        )
-    return paths
-
-
 def read_photo(path: Path, settings: AcquisitionSettings) -> Photo:
     """Decode one photo, turn it upright and bring it to working size.
 
     Raises:
-        PhotoUnreadableError: it is not an image, is cut off, or is absurdly large.
+        PhotoUnreadableError: it is not an image, is cut off, or has absurdly many or few pixels.
+        PhotoRawError: it holds a sensor's readings.
     """
-    try:
-        data = path.read_bytes()
-        with Image.open(io.BytesIO(data), formats=PHOTO_FORMATS) as opened:
-            width, height = opened.size
-            if width * height > LARGEST_PHOTO_PIXELS:
-                raise PhotoUnreadableError(
-                    f"{path.name} has {width} x {height} pixels, more than any phone takes.",
-                    advice="Give the photo as the phone made it.",
-                    photo=path.name,
-                )
-            exif = opened.getexif()
-            # A JPEG decodes straight to a half or a quarter of its size where that is still large enough.
-            opened.draft("RGB", (settings.working_px, settings.working_px))
-            details = exif.get_ifd(ExifTags.IFD.Exif)
-            turns = QUARTER_TURNS.get(exif.get(ExifTags.Base.Orientation, 1), 0)
-            ImageOps.exif_transpose(opened, in_place=True)
-            image = _eight_bit(opened)
-    except PhotoUnreadableError:
-        raise
-    except Exception as error:
-        # Not a list of types: on damaged files the decoders raise anything, ZeroDivisionError included.
+    decoded = decode_photo(path, settings.working_px)
+    image = decoded.pixels
+    width, height = image.shape[1], image.shape[0]
+    factor = min(settings.working_px / max(width, height), 1.0)
+    size = round(width * factor), round(height * factor)
+    if min(size) < LEAST_SIDE_PX:
         raise PhotoUnreadableError(
-            f"{path.name} does not decode as an image ({_reason(error)}).",
-            advice="Copy the photo from the phone again, or take it again.",
+            f"{path.name} has {decoded.full_size[0]} x {decoded.full_size[1]} pixels: too few to show anything.",
+            advice="Give the photo as the phone made it.",
             photo=path.name,
-        ) from error
-    if turns % 2:
-        width, height = height, width
-    longer = max(image.shape[:2])
-    if longer > settings.working_px:
-        factor = settings.working_px / longer
-        size = (round(image.shape[1] * factor), round(image.shape[0] * factor))
+        )
+    if factor < 1:
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    equivalent = decoded.stated.focal_35mm
     return Photo(
-        path.name, np.ascontiguousarray(image), (width, height),
-        _focal_px(details, image.shape[1], image.shape[0]), _subject_mm(details), sharpness_of(image),
-        hashlib.sha256(data).hexdigest(), turns,
+        path.name, np.ascontiguousarray(image), decoded.full_size,
+        equivalent / FULL_FRAME_DIAGONAL_MM * math.hypot(*size) if equivalent else None,
+        decoded.stated.subject_mm, sharpness_of(image), decoded.digest, decoded.quarter_turns, decoded.stated,
     )  # fmt: skip
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, UnidentifiedImageError):
-        return "no known image format"
-    return str(error) or type(error).__name__
-
-
-def _eight_bit(image: Image.Image) -> NDArray[np.uint8]:
-    if image.mode.startswith(("I", "F")):
-        values = np.asarray(image, float)
-        top = 65535.0 if values.max() > 255 else 255.0
-        grey = np.clip(values / top * 255, 0, 255).astype(np.uint8)
-        return np.repeat(grey[..., None], 3, axis=2)
-    return np.asarray(image if image.mode == "RGB" else image.convert("RGB"), np.uint8)
-
-
-def _focal_px(details: dict[int, object], width: int, height: int) -> float | None:
-    """Focal length in pixels from the 35 mm equivalent, which refers to the diagonal (CIPA DCG-001)."""
-    value = _number(details.get(ExifTags.Base.FocalLengthIn35mmFilm))
-    return value / FULL_FRAME_DIAGONAL_MM * math.hypot(width, height) if value and 8 < value < 300 else None
-
-
-def _subject_mm(details: dict[int, object]) -> float | None:
-    value = _number(details.get(ExifTags.Base.SubjectDistance))
-    return value * 1000 if value and 0.02 < value < 20 else None
-
-
-def _number(value: object) -> float | None:
-    try:
-        number = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    return number if math.isfinite(number) and number > 0 else None
 
 
 def sharpness_of(image: NDArray[np.uint8]) -> float:
@@ -216,7 +147,8 @@ def read_photos(
 
     Photos of one camera held upright and across come in two shapes. One lens for all wants one shape, and nothing
     later cares how a photo is rolled, so those of the rarer shape are turned by 90 degrees, back to how the sensor
-    read them where EXIF tells. Photos of yet another size are foreign.
+    read them where EXIF tells. Where EXIF says that one camera took photos of several resolutions, all come to one
+    working size. Photos of another camera, lens or zoom, and crops, are foreign.
 
     Raises:
         PhotoUnreadableError: too few are left because photos do not decode.
@@ -244,39 +176,95 @@ def read_photos(
                 seen[result.digest] = result.name
                 photos.append(result)
             progress(done / len(paths))
-    photos, foreign = _of_one_shape(photos)
+    photos, foreign = of_one_camera(photos)
     refused += foreign
     if len(photos) < settings.least_photos:
-        unreadable = [r for r in refused if r.code == PhotoUnreadableError.code]
-        leaf = PhotoUnreadableError if unreadable else TooFewPhotosError
-        raise leaf(
-            f"{len(photos)} usable photos of {len(paths)}; at least {settings.least_photos} are needed."
-            + (f" {unreadable[0].reason}" if unreadable else ""),
-            advice=f"Take {RECOMMENDED_PHOTOS} or more photos all around the specimen, from 30 to 60 degrees up.",
-            usable=len(photos),
-            refused={r.name: r.reason for r in refused},
-        )
+        raise _too_few(paths, photos, refused, settings.least_photos)
     return photos, refused
 
 
-def _of_one_shape(photos: list[Photo]) -> tuple[list[Photo], list[Refusal]]:
-    """Turn photos into the shape that most have; refuse those of another size."""
+def _too_few(
+    paths: list[Path], photos: list[Photo], refused: list[Refusal], least: int
+) -> PhotoUnreadableError | TooFewPhotosError:
+    unreadable = [r for r in refused if r.code in (PhotoUnreadableError.code, PhotoRawError.code)]
+    leaf: type[PhotoUnreadableError | TooFewPhotosError] = PhotoUnreadableError if unreadable else TooFewPhotosError
+    advice = f"Take {RECOMMENDED_PHOTOS} or more photos all around the specimen, from 30 to 60 degrees up."
+    if unreadable and all(r.code == PhotoRawError.code for r in unreadable):
+        leaf, advice = PhotoRawError, "Export the raw files as JPEG, all with the same settings, not cropped."
+    elif refused:
+        advice = "Details give the reason for each photo. " + advice
+    first = unreadable[:1] or refused[:1]
+    beside = photo_folder(paths[0].parent).remarks() if paths else []
+    return leaf(
+        " ".join([
+            f"{len(photos)} usable photos of {len(paths)}; at least {least} are needed.",
+            *(f"{r.name}: {r.reason}" for r in first),
+            *(sentence for _, sentence in beside),
+        ]),
+        advice=advice,
+        usable=len(photos),
+        refused={r.name: r.reason for r in refused},
+    )  # fmt: skip
+
+
+def of_one_camera(photos: list[Photo]) -> tuple[list[Photo], list[Refusal]]:
+    """Photos at one working size, in the shape that most have; those of another camera, lens or zoom are refused."""
+    if not photos:
+        return [], []
     shapes = Counter(p.full_size for p in photos)
-    if len(shapes) < 2:
-        return photos, []
     # A camera's pictures count together, however it was held.
-    usual = max(shapes, key=lambda s: (shapes[s] + shapes[s[::-1]] * (s[0] != s[1]), shapes[s]))
+    usual = max(
+        shapes, key=lambda s: (shapes[s] + shapes[s[::-1]] * (s[0] != s[1]), shapes[s], s[0] * s[1])
+    )
+    of_usual = [p for p in photos if p.full_size in (usual, usual[::-1])]
+    camera = _usual_camera(of_usual)
     turns = Counter(p.quarter_turns for p in photos if p.full_size == usual).most_common(1)[0][0]
+    size = Counter(p.size for p in photos if p.full_size == usual).most_common(1)[0][0]
     kept: list[Photo] = []
     refused: list[Refusal] = []
     for photo in photos:
-        w, h = photo.full_size
-        if (w, h) == usual:
-            kept.append(photo)
-        elif (h, w) == usual:
+        why = _foreign(photo, usual, size, camera)
+        if why:
+            refused.append(Refusal(photo.name, "photo_foreign", f"It {why}."))
+            continue
+        if usual[0] != usual[1] and (photo.full_size[0] > photo.full_size[1]) != (usual[0] > usual[1]):
             by = (turns - photo.quarter_turns) % 4
-            kept.append(photo.turned(by if by % 2 else 1))
-        else:
-            reason = f"It has {w} x {h} pixels, the others {usual[0]} x {usual[1]}: another camera."
-            refused.append(Refusal(photo.name, "photo_foreign", reason))
+            photo = photo.turned(by if by % 2 else 1)
+        kept.append(photo.at_size(size))
     return kept, refused
+
+
+def _usual_camera(photos: list[Photo]) -> CameraStated:
+    """What most of the photos state, each field by itself."""
+
+    def most(values: list[float]) -> float | None:
+        return Counter(values).most_common(1)[0][0] if values else None
+
+    models = [p.camera.model for p in photos if p.camera.model]
+    return CameraStated(
+        model=Counter(models).most_common(1)[0][0] if models else None,
+        focal_35mm=most([p.camera.focal_35mm for p in photos if p.camera.focal_35mm]),
+        focal_mm=most([p.camera.focal_mm for p in photos if p.camera.focal_mm]),
+        digital_zoom=most([p.camera.digital_zoom for p in photos]) or 1.0,
+    )
+
+
+def _foreign(photo: Photo, usual: tuple[int, int], size: tuple[int, int], camera: CameraStated) -> str | None:
+    """Why a photo is not of the camera whose photos mostly have the ``usual`` size, ``size`` at work; None if it is."""
+    contradiction = photo.camera.contradiction(camera)
+    if contradiction or photo.full_size in (usual, usual[::-1]):
+        return contradiction
+    (w, h), (usual_w, usual_h) = photo.full_size, usual
+    sizes = f"has {w} x {h} pixels, the others {usual_w} x {usual_h}"
+    if not same_shape(photo.full_size, usual):
+        return f"{sizes}: another camera, or a part cut out"
+    if not photo.camera.same_as(camera):
+        return f"{sizes}, and its EXIF does not say that the same camera took it"
+    if max(size) > MOST_ENLARGED * max(photo.size):
+        return f"{sizes}: too small beside them"
+    return None
+
+
+def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two sizes have the same ratio of longer to shorter side, however the camera was held."""
+    return abs(max(size) * min(other) / (min(size) * max(other)) - 1) < SAME_ASPECT

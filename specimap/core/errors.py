@@ -47,6 +47,12 @@ class PhotoUnreadableError(SpecimapError, ValueError):
     code = "photo_unreadable"
 
 
+class PhotoRawError(PhotoUnreadableError):
+    """A photo is a raw file: a sensor's readings, not a picture."""
+
+    code = "photo_raw"
+
+
 class TooFewPhotosError(SpecimapError, ValueError):
     """Fewer photos than the minimum, as given or after refusing some."""
 
@@ -104,6 +110,12 @@ class MarkerGeometryError(SpecimapError, ValueError):
     code = "marker_geometry_unsolvable"
 
 
+class EdgeImplausibleError(SpecimapError, ValueError):
+    """The marker edge puts the cameras where none can have been; ``details['distance_mm']`` says where."""
+
+    code = "edge_implausible"
+
+
 # ---- cube ---------------------------------------------------------------------------------------------
 
 
@@ -151,6 +163,12 @@ class RegistrationError(SpecimapError, ValueError):
     """The cube's camera cannot be solved, or its rays miss the surface."""
 
     code = "registration_failed"
+
+
+class ResultInsufficientError(SpecimapError, ValueError):
+    """Hardly a pixel between the markers got a place: the result would be of no use; details hold the figures."""
+
+    code = "result_insufficient"
 
 
 # ---- cloud --------------------------------------------------------------------------------------------
@@ -245,6 +263,7 @@ HTTP_STATUS: dict[type[SpecimapError], int] = {
     CubeTruncatedError: 422,
     DepthNotFoundError: 422,
     DuplicateMarkersError: 422,
+    EdgeImplausibleError: 422,
     LabelInvalidError: 422,
     MarkerGeometryError: 422,
     MarkersMissingInCubeError: 422,
@@ -253,9 +272,11 @@ HTTP_STATUS: dict[type[SpecimapError], int] = {
     NotFoundError: 404,
     OutputExistsError: 409,
     OutputNotWritableError: 500,
+    PhotoRawError: 422,
     PhotoUnreadableError: 422,
     PhotosNotConnectedError: 422,
     RegistrationError: 422,
+    ResultInsufficientError: 422,
     SettingsError: 422,
     StageFailedError: 500,
     StorageFullError: 507,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,6 +14,7 @@ from specimap.core.colour import linear_from_srgb
 from specimap.core.errors import CloudDamagedError, SettingsError
 from specimap.core.files import atomic_path
 from specimap.core.geometry import Array
+from specimap.core.jsontext import json_text
 from specimap.core.surface import Mesh
 
 _VERTEX = np.dtype([("p", "<f4", 3), ("n", "<f4", 3), ("c", "u1", 3)])
@@ -146,7 +146,7 @@ def _write_glb(file: BinaryIO, mesh: Mesh) -> None:
         "bufferViews": views,
         "accessors": accessors,
     }
-    text = json.dumps(document, separators=(",", ":")).encode("ascii")
+    text = json_text(document, separators=(",", ":")).encode("ascii")
     text += b" " * (-len(text) % 4)
     file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + at))
     file.write(struct.pack("<I4s", len(text), b"JSON") + text)

@@ -11,7 +11,7 @@ from specimap.core.errors import SettingsError
 from specimap.core.geometry import Floats
 from specimap.core.raycast import RayCaster
 
-LARGEST_GRID_CELLS = 60_000_000
+LARGEST_GRID_CELLS = 25_000_000
 
 
 @dataclass(frozen=True)

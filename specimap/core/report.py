@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from specimap.core.errors import NotFoundError
+from specimap.core.jsontext import json_ready, json_text
 
 # JSON has no NaN: a figure that could not be had is null there.
 Figure = Annotated[float, BeforeValidator(lambda value: float("nan") if value is None else value)]
@@ -23,8 +23,8 @@ class Section(BaseModel):
 class Spread(Section):
     """Mean and standard deviation of ``n`` values, mm."""
 
-    mean: float
-    std: float
+    mean: Figure
+    std: Figure
     n: int
 
 
@@ -40,18 +40,18 @@ class Quartiles(Section):
 class EdgeLength(Section):
     """Edges of the triangulated markers against the known edge, mm."""
 
-    expected: float
-    mean: float
-    std: float
+    expected: Figure
+    mean: Figure
+    std: Figure
     n: int
 
 
 class LeaveOneOut(Section):
     """Errors at a marker that took no part in the registration, mm. None where too few markers are left."""
 
-    median: float
-    maximum: float
-    per_marker: dict[str, float]
+    median: Figure
+    maximum: Figure
+    per_marker: dict[str, Figure]
 
 
 class Refused(Section):
@@ -75,15 +75,15 @@ class Inliers(Section):
 
     n: int
     of: int
-    threshold_px: float
-    threshold_mm: float
+    threshold_px: Figure
+    threshold_mm: Figure
 
 
 class Reprojection(Section):
     """RMS corner distance in the photos, pixels, before and after stage 2."""
 
-    before: float
-    after: float
+    before: Figure
+    after: Figure
 
 
 class MethodFigures(Section):
@@ -97,11 +97,11 @@ class MethodFigures(Section):
 class CubeCameraFigures(Section):
     """The solved camera of the cube."""
 
-    focal_px: float
-    focal_relative_sd: float
-    distance_mm: float
-    reprojection_rms_px: float
-    roll_deg: float
+    focal_px: Figure
+    focal_relative_sd: Figure
+    distance_mm: Figure
+    reprojection_rms_px: Figure
+    roll_deg: Figure
     mirrored: bool
     markers_found_in: str
 
@@ -109,15 +109,15 @@ class CubeCameraFigures(Section):
 class Parallax(Section):
     """Distance between where the two methods put a pixel of the specimen, mm."""
 
-    median: float
-    maximum: float
+    median: Figure
+    maximum: Figure
 
 
 class SigmaFigures(Section):
     """Stated standard deviation of the specimen's points, mm."""
 
-    median: float
-    p95: float
+    median: Figure
+    p95: Figure
 
 
 class Remark(Section):
@@ -130,12 +130,12 @@ class Remark(Section):
 class Coverage(Section):
     """Share of the cube's pixels between the markers that have a point; counts of points."""
 
-    between_markers: float
+    between_markers: Figure
     points: int
     specimen_points: int
 
 
-Corners = Annotated[list[list[float]], Field(description="x, y of four corners a marker: eight numbers.")]
+Corners = Annotated[list[list[Figure]], Field(description="x, y of four corners a marker: eight numbers.")]
 
 
 class PhotoCorners(Section):
@@ -178,7 +178,7 @@ class Report(Section):
     leave_one_marker_out_mm: LeaveOneOut | None
     methods: dict[str, MethodFigures]
     edge_length_mm: EdgeLength
-    corner_sigma_mm: float
+    corner_sigma_mm: Figure
     reprojection_px: Reprojection
     photos: Photos
     inliers: Inliers
@@ -186,8 +186,8 @@ class Report(Section):
     parallax_removed_mm: Parallax
     sigma_mm: SigmaFigures
     cube_camera: CubeCameraFigures
-    photo_focal_px: float
-    seconds: dict[str, float]
+    photo_focal_px: Figure
+    seconds: dict[str, Figure]
     reused_stages: list[str]
     warnings: list[Remark]
     settings: dict[str, object] = Field(default_factory=dict)
@@ -198,11 +198,12 @@ class Report(Section):
 
     def summary(self) -> dict[str, object]:
         """As JSON values, without what report.json alone holds: readers of a cloud fetch its attributes first."""
-        return self.model_dump(mode="json", exclude=_DETAILS)
+        ready: dict[str, object] = json_ready(self.model_dump(mode="json", exclude=_DETAILS))
+        return ready
 
     def text(self) -> str:
         """The report as JSON for people and programs: a line a field, but a line a photo for the corners."""
-        head = self.model_dump_json(indent=1, exclude=_DETAILS)
+        head = json_text(self.summary(), indent=1, ensure_ascii=False)
         if self.photo_corners is None:
             return head
         photos = ",\n".join(f"  {_compact(photo)}" for photo in self.photo_corners)
@@ -215,7 +216,7 @@ _DETAILS = {"photo_corners", "cube_corners"}
 
 
 def _compact(section: Section) -> str:
-    return json.dumps(section.model_dump(mode="json"), separators=(",", ":"), ensure_ascii=False)
+    return json_text(section.model_dump(mode="json"), separators=(",", ":"), ensure_ascii=False)
 
 
 def read_report(folder: Path) -> Report:

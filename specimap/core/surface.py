@@ -88,10 +88,10 @@ def fuse(
         grid.integrate(blocks, depth, colour, K, K, T, NEAREST_MM, far, settings.truncation_voxels)
         progress(done / len(maps))
     if not touched:
-        raise _no_surface()
+        raise _no_surface(len(maps))
     mesh = grid.extract_triangle_mesh(settings.least_weight)
     if "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
-        raise _no_surface()
+        raise _no_surface(len(maps))
     vertices = mesh.vertex.positions.numpy()
     triangles = mesh.triangle.indices.numpy().astype(np.int32)
     colours = np.clip(mesh.vertex.colors.numpy() * 255, 0, 255).astype(np.uint8)
@@ -107,10 +107,10 @@ def _with_known_depth(depth_map: DepthMap) -> DepthMap:
     return replace(depth_map, depth=np.where(np.isfinite(depth) & (depth > NEAREST_MM), depth, np.float32(0)))
 
 
-def _no_surface() -> DepthNotFoundError:
+def _no_surface(pairs: int) -> DepthNotFoundError:
     return DepthNotFoundError(
-        "The photos gave no common surface.",
-        advice="Take sharper photos from 10-20 degrees apart, all around, with the specimen in the middle.",
+        f"{pairs} pairs of photos gave depth, but they agree on no surface.",
+        advice="Leave specimen and markers unmoved between photos, which are best 10 to 20 degrees apart.",
     )
 
 

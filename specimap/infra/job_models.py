@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from sqlalchemy.orm import Session
 
 from specimap.core.errors import SettingsError
+from specimap.core.limits import RANGES
 from specimap.infra.models import PRIORITIES, Acquisition, CloudRow, Job
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
@@ -24,7 +25,11 @@ Dictionary = Literal[
 ]  # fmt: skip
 """OpenCV's predefined dictionaries, named here so that no service needs OpenCV to check a name."""
 EdgeMm = Annotated[
-    float, Field(ge=0.5, le=200, allow_inf_nan=False, description="Edge of a marker's black square, mm.")
+    float,
+    Field(
+        ge=RANGES["edge_mm"][0], le=RANGES["edge_mm"][1], allow_inf_nan=False,
+        description="Edge of a marker's black square, mm.",
+    ),
 ]
 
 
@@ -39,8 +44,14 @@ class JobSettings(BaseModel):
     adjustment: Literal["rigid", "free"] = Field(
         default="rigid", description="`rigid` squares, or `free` corners as published."
     )
-    r_pc: float = Field(default=0.5, ge=0.05, le=20, allow_inf_nan=False, description="Cell of the fine grid, mm.")
-    r_reg: float = Field(default=2.0, ge=0.05, le=20, allow_inf_nan=False, description="Cell of the coarse grid, mm.")
+    r_pc: float = Field(
+        default=0.5, ge=RANGES["r_pc"][0], le=RANGES["r_pc"][1], allow_inf_nan=False,
+        description="Cell of the fine grid, mm.",
+    )
+    r_reg: float = Field(
+        default=2.0, ge=RANGES["r_reg"][0], le=RANGES["r_reg"][1], allow_inf_nan=False,
+        description="Cell of the coarse grid, mm.",
+    )
     backend: Literal["colmap", "mast3r", "da3"] = Field(
         default="colmap", description="Reconstruction backend; the learned ones need weights on the worker."
     )
@@ -48,7 +59,8 @@ class JobSettings(BaseModel):
         default="auto", description="Features that locate photos which the markers leave open."
     )
     working_px: int = Field(
-        default=1280, ge=320, le=8192, description="Longer side that larger photos are brought to, pixels."
+        default=1280, ge=RANGES["working_px"][0], le=RANGES["working_px"][1],
+        description="Longer side that larger photos are brought to, pixels."
     )
     dictionary: Dictionary | None = Field(default=None, description="Marker dictionary; by default the acquisition's.")
     edge_mm: EdgeMm | None = Field(default=None, description="Edge of a marker, mm; by default the acquisition's.")

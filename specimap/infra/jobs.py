@@ -7,7 +7,6 @@ claimed it last, and a write by another, or after the end, changes nothing and r
 
 from __future__ import annotations
 
-import json
 import math
 from typing import Any, Literal
 
@@ -15,6 +14,7 @@ import sqlalchemy as sa
 from sqlalchemy.orm import Session
 
 from specimap.core.errors import NotFoundError, SpecimapError
+from specimap.core.jsontext import json_ready
 from specimap.infra.database import utc_now
 from specimap.infra.errors import JobConflictError, LostLeaseError
 from specimap.infra.ids import new_id
@@ -199,7 +199,7 @@ def _change(
         if executor is not None and job.executor != executor:
             raise _lost(job.id, executor)
         job.finished_at = utc_now()
-        job.error = None if error is None else _plain(error.as_dict() if isinstance(error, SpecimapError) else error)
+        job.error = json_ready(error.as_dict() if isinstance(error, SpecimapError) else error)
         event["error"] = job.error
         event["cloud_id"] = session.scalar(sa.select(CloudRow.id).where(CloudRow.job_id == job.id))
         if job.webhook is not None:
@@ -215,7 +215,7 @@ def _change(
 def _append(session: Session, job: Job, type: EventType, data: dict[str, Any]) -> int:
     """Write the next event of a locked job."""
     last = session.scalar(sa.select(sa.func.max(JobEvent.seq)).where(JobEvent.job_id == job.id)) or 0
-    session.add(JobEvent(job_id=job.id, seq=last + 1, type=type, data=_plain(data)))
+    session.add(JobEvent(job_id=job.id, seq=last + 1, type=type, data=json_ready(data)))
     session.flush()
     return last + 1
 
@@ -246,16 +246,3 @@ def _lost(job_id: str, executor: str) -> LostLeaseError:
         job_id=job_id,
         executor=executor,
     )
-
-
-def _plain(value: Any) -> Any:
-    """JSON values only: a number that is none becomes null, what JSON does not know becomes text."""
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if value is None or isinstance(value, str | int | bool):
-        return value
-    return json.loads(json.dumps(value, default=str))

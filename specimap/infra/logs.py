@@ -8,6 +8,7 @@ import sys
 import structlog
 from structlog.tracebacks import ExceptionDictTransformer
 
+from specimap.core.jsontext import json_log_line
 from specimap.infra.settings import ServiceSettings
 
 SHARED: tuple[structlog.typing.Processor, ...] = (
@@ -24,7 +25,7 @@ def set_up_logs(settings: ServiceSettings) -> None:
         tail: list[structlog.typing.Processor] = [
             # Without local variables: among them are keys and names that came with uploads.
             structlog.processors.ExceptionRenderer(ExceptionDictTransformer(show_locals=False)),
-            structlog.processors.JSONRenderer(),
+            structlog.processors.JSONRenderer(serializer=json_log_line),
         ]
     else:
         plain = structlog.dev.plain_traceback

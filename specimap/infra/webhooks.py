@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime
 import hashlib
 import hmac
-import json
 import ssl
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +13,7 @@ import httpx
 import sqlalchemy as sa
 
 from specimap.core.errors import SettingsError
+from specimap.core.jsontext import json_text
 from specimap.infra.database import Database, utc_now
 from specimap.infra.job_models import job_views
 from specimap.infra.logs import logger
@@ -135,10 +135,10 @@ def _send(claimed: _Claimed, settings: ServiceSettings, client: httpx.Client) ->
         return "host not allowed", False
     sent = utc_now()
     content = {"event": f"job.{claimed.job['state']}", "job": claimed.job, "delivered_at": sent.isoformat()}
-    body = json.dumps(content).encode()
+    body = json_text(content).encode()
     if len(body) > LARGEST_BODY and claimed.job["error"]:
         content["job"] = {**claimed.job, "error": {**claimed.job["error"], "details": {}}}
-        body = json.dumps(content).encode()
+        body = json_text(content).encode()
     headers = {SIGNATURE: sign(claimed.secret, body, int(sent.timestamp())), DELIVERY: claimed.id}
     try:
         # Streamed, so that an endless answer is not read.

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import datetime
 import hashlib
-import json
 from typing import Annotated, Any
 
 from fastapi import Header, Path, Query
 from pydantic import BaseModel, ConfigDict, Field
 
+from specimap.core.jsontext import json_text
 from specimap.infra.job_models import JobSettings, PriorityName
 
 JobId = Annotated[str, Path(pattern=r"^job_[0-9a-z]{26}$")]
@@ -85,7 +85,7 @@ class RerunRequest(BaseModel):
 
 def digest_of(request: dict[str, Any]) -> str:
     """SHA-256 of a request's values."""
-    return hashlib.sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json_text(request, sort_keys=True).encode()).hexdigest()
 
 
 class LogLine(BaseModel):

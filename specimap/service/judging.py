@@ -20,6 +20,7 @@ from typing import Any
 
 from specimap.core.errors import BackendUnavailableError
 from specimap.core.files import disk_errors, remove
+from specimap.core.jsontext import json_text
 from specimap.infra.logs import logger
 from specimap.infra.settings import ServiceSettings
 from specimap.service.verdicts import checked_verdict
@@ -189,7 +190,7 @@ class _Child:
         """Its answer to a task. Raises TimeoutError, _GoneError."""
         assert self._process.stdin is not None
         try:
-            self._process.stdin.write(json.dumps(task).encode() + b"\n")
+            self._process.stdin.write(json_text(task).encode() + b"\n")
         except (OSError, ValueError) as error:
             raise _GoneError from error
         return self.receive(seconds)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 import shutil
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from specimap.core.cloud.labels import describe_label, write_label
 from specimap.core.errors import NotFoundError
 from specimap.core.files import disk_errors, remove
 from specimap.core.geometry import Array
+from specimap.core.jsontext import json_text
 from specimap.infra.errors import DatabaseUnavailableError, PreconditionFailedError, RequestInvalidError
 from specimap.infra.labels import lock_cloud
 from specimap.infra.models import LabelVersion
@@ -180,7 +180,7 @@ def _publish(storage: Storage, work: Path, prefix: str, attributes: dict[str, An
 
 
 def _digest(metadata: LabelMetadata, values: Array) -> str:
-    text = json.dumps([metadata.as_stored(), values.dtype.str, values.shape], sort_keys=True)
+    text = json_text([metadata.as_stored(), values.dtype.str, values.shape], sort_keys=True)
     digest = hashlib.sha256(text.encode())
     digest.update(values.tobytes())
     return digest.hexdigest()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import json
 import os
 import resource
 import signal
@@ -16,6 +15,7 @@ from specimap.core.errors import SpecimapError
 from specimap.core.export import ExportFormat, export_cloud
 from specimap.core.export.archive import write_envi_zip, write_zarr_zip
 from specimap.core.export.formats import FileFormat
+from specimap.core.jsontext import json_text
 
 PR_SET_PDEATHSIG = 1
 REFUSED = 2
@@ -70,7 +70,7 @@ def main(arguments: list[str]) -> int:
     else:
         return 0
     with answer:
-        answer.write(json.dumps(refused.as_dict()))
+        answer.write(json_text(refused.as_dict()))
     return REFUSED
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from specimap.core.errors import NotFoundError
+from specimap.core.jsontext import json_text
 from specimap.core.pipeline.keys import digest_of, register_key, surface_keys
 from specimap.core.pipeline.settings import settings_from
 from specimap.infra.database import Database
@@ -83,7 +83,7 @@ def plan_of(database: Database, job_id: str) -> Plan:
     }  # fmt: skip
     settings = settings_from(**chosen)
     keys = surface_keys(photos, settings)
-    digest = hashlib.sha256(json.dumps(cube, sort_keys=True).encode()).hexdigest()
+    digest = hashlib.sha256(json_text(cube, sort_keys=True).encode()).hexdigest()
     keys["register"] = register_key(keys["render"], digest, settings)
     return Plan(
         job.id, acquisition.id, files, chosen, keys,

@@ -14,6 +14,7 @@ from functools import partial
 from typing import Any
 
 from specimap.core.errors import SpecimapError
+from specimap.core.jsontext import json_text
 from specimap.core.reconstruct.learned.environment import BACKEND_VARIABLES
 from specimap.infra.errors import StageTimeoutError
 from specimap.workers.cells import Cell, Cells
@@ -99,7 +100,7 @@ class StageProcess:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         with suppress(ConnectionError):  # it has ended: the reading below tells how
-            self._process.stdin.write(json.dumps(spec).encode() + b"\n")
+            self._process.stdin.write(json_text(spec).encode() + b"\n")
             await self._process.stdin.drain()
         async for line in self._process.stdout:
             event = json.loads(line)

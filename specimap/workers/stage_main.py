@@ -15,6 +15,8 @@ import sys
 from pathlib import Path
 from typing import Any, TextIO
 
+from specimap.core.jsontext import json_text
+
 PR_SET_PDEATHSIG = 1
 
 
@@ -26,7 +28,7 @@ def die_with(parent: int) -> None:
 
 
 def _say(out: TextIO, **event: object) -> None:
-    out.write(json.dumps(event) + "\n")
+    out.write(json_text(event) + "\n")
     out.flush()
 
 

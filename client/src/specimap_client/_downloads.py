@@ -114,7 +114,7 @@ def fetch_zarr(session: Session, cloud: str, target: Path, heard: Heard | None =
     for name, document in documents.items():
         folder = part / name
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / _DOCUMENT).write_text(json.dumps(document, indent=1), "utf-8")
+        (folder / _DOCUMENT).write_text(json.dumps(document, indent=1, allow_nan=False), "utf-8")
         keys += [f"{name}/{chunk}" for chunk in chunk_keys(document)]
     for done, key in enumerate(keys):
         file = part / key

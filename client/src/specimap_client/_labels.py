@@ -82,7 +82,7 @@ def put_label(
         "made_by": {"name": made_by} if isinstance(made_by, str) else dict(made_by),
     }
     # Plain ASCII: a header carries nothing else safely.
-    headers = {"Content-Type": NPY, "X-Specimap-Label": json.dumps(metadata, ensure_ascii=True)}
+    headers = {"Content-Type": NPY, "X-Specimap-Label": json.dumps(metadata, ensure_ascii=True, allow_nan=False)}
     if if_version == 0:
         headers["If-None-Match"] = "*"
     elif if_version is not None:

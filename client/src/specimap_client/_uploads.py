@@ -176,5 +176,5 @@ class _Notes:
             self._path.unlink(missing_ok=True)
             return
         part = self._path.with_name(self._path.name + ".part")
-        part.write_text(json.dumps(self._all, indent=1), "utf-8")
+        part.write_text(json.dumps(self._all, indent=1, allow_nan=False), "utf-8")
         os.replace(part, self._path)

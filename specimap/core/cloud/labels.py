@@ -19,11 +19,12 @@ from zarr.codecs import BloscCodec, BytesCodec
 from specimap.core.cloud.schema import SHARD_POINTS
 from specimap.core.errors import LabelInvalidError
 from specimap.core.geometry import Array
+from specimap.core.jsontext import json_text
 
 Kind = Literal["class", "probability"]
 CHUNK_LABELS = 4096
 LARGEST_CLASS = 65535
-GROUP_DOCUMENT = json.dumps({"zarr_format": 3, "node_type": "group", "attributes": {}}, indent=1).encode()
+GROUP_DOCUMENT = json_text({"zarr_format": 3, "node_type": "group", "attributes": {}}, indent=1).encode()
 """``labels/zarr.json`` beside the layers, so that readers find the group that holds them."""
 
 
@@ -105,4 +106,4 @@ def describe_label(path: Path, attributes: Mapping[str, object]) -> None:
     """Set the attributes of a written layer: ``kind``, ``classes``, ``made_by``, ``version``; JSON values."""
     document = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
     document["attributes"] = dict(attributes)
-    (path / "zarr.json").write_text(json.dumps(document, indent=1, allow_nan=False), encoding="utf-8")
+    (path / "zarr.json").write_text(json_text(document, indent=1), encoding="utf-8")

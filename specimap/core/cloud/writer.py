@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -32,6 +31,7 @@ from specimap.core.cloud.written import Written
 from specimap.core.errors import RegistrationError
 from specimap.core.files import atomic_path
 from specimap.core.geometry import Array
+from specimap.core.jsontext import json_text
 
 UNITS = {"length": "mm", "wavelength": "nm"}
 
@@ -266,21 +266,8 @@ def _codec(inner: list[int], itemsize: int) -> dict[str, object]:
 
 def _write_group_metadata(group: Path, attributes: dict[str, object]) -> None:
     # Not consolidated: labels are added later, and a copy of their metadata here would go stale.
-    document = {"zarr_format": 3, "node_type": "group", "attributes": json_ready(attributes)}
-    (group / "zarr.json").write_text(json.dumps(document, indent=1, allow_nan=False), encoding="utf-8")
-
-
-def json_ready(value: object) -> object:
-    """``value`` with numpy's numbers and arrays, tuples and paths as JSON's; what is not finite as null."""
-    if isinstance(value, Mapping):
-        return {str(key): json_ready(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        return json_ready(value.tolist())
-    if isinstance(value, list | tuple | set | frozenset):
-        return [json_ready(item) for item in value]
-    if isinstance(value, float):
-        return value if np.isfinite(value) else None
-    return str(value) if isinstance(value, Path) else value
+    document = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
+    (group / "zarr.json").write_text(json_text(document, indent=1), encoding="utf-8")
 
 
 @contextmanager

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from specimap.core.acquisition import RECOMMENDED_PHOTOS
 from specimap.core.document.blocks import Level
 from specimap.core.document.photo_figures import LIMIT_MM
+from specimap.core.gates import LEAST_COVERAGE, MOST_CUBE_RMS_PX, corner_limit_px, outlying_photos
 from specimap.core.report import Report
 
 MOST_REFUSED = 2
-LEAST_COVERAGE = 0.97
 LAYOUT_MARKERS = 8
 """Up to so many markers, all should show in the cube; of a whole board, four suffice."""
 
@@ -57,6 +57,12 @@ REMARKS = {
     "dense_gpu_failed": "Nothing for this result. Have the worker's GPU looked at, or set it to use the CPU.",
     "backend_run": "Nothing: keep it with the result, so that it can be repeated.",
     "depth_unaligned": "Show two or more markers in the photos that are named, or run the default backend.",
+    "coverage_low": "Take more photos, also from the side that is missing in the coverage map, sharp and evenly lit.",
+    "specimen_not_found": "Check that the specimen lies between the markers and higher than they do.",
+    "corners_scatter": "Take all photos again, touching neither markers nor specimen in between, with one lens.",
+    "photo_outlying": "Look at the photos that are named: a card moved, or another lens. Take them again.",
+    "cube_corners_scatter": "Record the cube again: all markers unmoved, sharp, and the sensor's pixels square.",
+    "files_passed_over": "Nothing, where none of them is a photo of this specimen; else put it beside the others.",
     "licence_apache": "Nothing: the licence allows any use.",
     "licence_non_commercial": "Use this result for no commercial purpose; run the default backend for any other.",
 }
@@ -64,12 +70,16 @@ UNKNOWN_REMARK = "Read it before using the result; the documentation of errors a
 
 REFUSALS = {
     "photo_unreadable": "Copy the photo again, or take it again.",
+    "photo_raw": "Export it as JPEG, with the same settings as the others.",
     "photo_duplicate": "Nothing: the same photo is used once.",
     "photo_blurred": "Take it again from the same side: tap to focus, hold still.",
     "photo_foreign": "Leave it out if it shows something else; else show the markers in it.",
     "photo_unlocated": "Take it again with two or more markers in view, between its neighbours.",
 }
-GRAVE = ("specimen_moved", "cube_camera_loose", "scale_implausible", "scale_contradicts_exif")
+GRAVE = (
+    "specimen_moved", "cube_camera_loose", "scale_implausible", "scale_contradicts_exif", "specimen_not_found",
+    "corners_scatter", "cube_corners_scatter",
+)  # fmt: skip
 """Warnings that put all places in doubt."""
 UNKNOWN_REFUSAL = "Take it again from the same side with the markers in view."
 
@@ -120,13 +130,14 @@ class Check:
 
 
 def checks(report: Report) -> list[Check]:
-    """The four lines that docs/surgeon-imaging.md tells to look at."""
+    """The lines that docs/surgeon-imaging.md tells to look at."""
     photos, left = report.photos, report.leave_one_marker_out_mm
     refused = photos.given - len(photos.used)
     in_photos, in_cube = report.marker_ids, report.marker_ids_in_cube
     missing = sorted(set(in_photos) - set(in_cube))
     of_a_board = len(in_photos) > LAYOUT_MARKERS
     covered = report.coverage.between_markers
+    rms, off, cube = report.reprojection_px.after, outlying_photos(report), report.cube_camera.reprojection_rms_px
     return [
         Check(
             "Photos used",
@@ -142,6 +153,21 @@ def checks(report: Report) -> list[Check]:
             len(in_cube) >= 4 if of_a_board else not missing,
             "Record the cube again with four or more markers in view, lit and uncovered." if of_a_board
             else f"Record the cube again with marker {_listed([str(i) for i in missing])} in view, lit and uncovered.",
+        ),
+        Check(
+            "Corners in the photos",
+            f"{rms:.2f} px" + (f"; {len(off)} photo{'s' * (len(off) != 1)} off" if off else ""),
+            f"{corner_limit_px(report):.1f} px or less, no photo far off",
+            rms <= corner_limit_px(report) and not off,
+            f"Look at {_listed([o.name for o in off])}: a card moved in between, or it is of another lens." if off
+            else "Take all photos again with one lens, touching neither markers nor specimen in between.",
+        ),
+        Check(
+            "Corners in the cube",
+            f"{cube:.2f} px",
+            f"{MOST_CUBE_RMS_PX:.1f} px or less",
+            cube <= MOST_CUBE_RMS_PX,
+            "Record the cube again, with markers unmoved and sharp.",
         ),
         Check(
             "Leaving a marker out",

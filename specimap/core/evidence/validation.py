@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from specimap.core.evidence.capture import Capture, find_capture
 from specimap.core.evidence.cases import Case
 from specimap.core.evidence.runs import Outcome, run_and_judge, scratch_in, stopping
 from specimap.core.files import write_text
+from specimap.core.jsontext import json_text
 from specimap.core.phantom import load_truth, write_phantom
 from specimap.core.pipeline import Inputs, PipelineSettings
 from specimap.core.pipeline.artefacts import FORMAT
@@ -150,7 +150,7 @@ def _key(case: Case) -> str:
     elif case.capture is not None:
         files = [*case.capture.photos, case.capture.cube, case.capture.folder / "truth.npz"]
         parts["files"] = {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
-    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:24]
+    return hashlib.sha256(json_text(parts, sort_keys=True).encode()).hexdigest()[:24]
 
 
 def _earlier(target: Path) -> list[Row]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import zipfile
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import numpy as np
 from specimap.core.cloud import Cloud
 from specimap.core.files import atomic_path
 from specimap.core.geometry import Array
+from specimap.core.jsontext import json_text
 
 _BLOCK = 16384
 
@@ -33,7 +33,7 @@ def write_npz(cloud: Cloud, target: Path) -> Path:
         "scale_factor": np.array(cloud.scale_factor),
         "add_offset": np.array(cloud.add_offset),
         "quantity": np.array(cloud.quantity),
-        "attributes": np.array(json.dumps(cloud.attributes)),
+        "attributes": np.array(json_text(cloud.attributes)),
     }
     if cloud.fill_value is not None:
         small["fill_value"] = np.array(cloud.fill_value, np.uint16)

@@ -31,6 +31,7 @@ from specimap.core.fiducials import detect_markers
 from specimap.core.intake.cube import judge_cube, judge_part
 from specimap.core.intake.photo import Others, judge_photo
 from specimap.core.intake.verdict import Verdict
+from specimap.core.jsontext import json_text
 from specimap.core.sandbox import MODES, Confinement, Mode, Reach, program_rules
 from specimap.core.sandbox.landlock import READ, WRITE
 from specimap.core.sandbox.places import Rule
@@ -95,7 +96,7 @@ class Copy:
                 said += piece
         # One line and no more: what follows would be taken for the next file's answer.
         line_said, end, _ = said.partition(b"\n")
-        return line_said + end if end else json.dumps(DIED).encode() + b"\n"
+        return line_said + end if end else json_text(DIED).encode() + b"\n"
 
     def end(self) -> None:
         """End it. That takes as long as making it: the answer is sent before."""
@@ -124,7 +125,7 @@ def _judge_one(reading: int, writing: int, memory: int, rules: list[Rule], mode:
     for limit, most in ((resource.RLIMIT_AS, at_rest + memory + mapped), (resource.RLIMIT_NOFILE, MOST_OPEN)):
         resource.setrlimit(limit, (most, most))
     confinement.enter([(str(folder), READ), (scratch, WRITE)], alone=True)
-    answer = json.dumps(TASKS[task["kind"]](task).as_dict()).encode() + b"\n"
+    answer = json_text(TASKS[task["kind"]](task).as_dict()).encode() + b"\n"
     while answer:
         answer = answer[os.write(writing, answer) :]
 
@@ -156,7 +157,7 @@ def main() -> None:
     Image.init()
     rules = program_rules(Reach(keep_from=[Path(place) for place in sys.argv[4:]]))
     copy = Copy(memory, rules, mode)
-    out.write(json.dumps({"ready": True}).encode() + b"\n")
+    out.write(json_text({"ready": True}).encode() + b"\n")
     for line in sys.stdin:
         out.write(copy.judge(line))
         copy.end()

@@ -12,12 +12,12 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
-from specimap.core.acquisition import PHOTO_FORMATS, AcquisitionSettings, read_photo
+from specimap.core.acquisition import AcquisitionSettings, read_photo, same_shape
 from specimap.core.errors import NoMarkersFoundError, PhotoUnreadableError, WrongDictionaryError
 from specimap.core.fiducials import detect_markers, fitting_dictionaries
 from specimap.core.intake.verdict import Verdict
+from specimap.core.photofile import photo_suffix
 
 LEAST_SIDE_PX = 240
 """Of the longer side: below it no marker in a usual view has the 7 pixels an edge needs."""
@@ -31,7 +31,6 @@ LEAST_OTHERS = 3
 LEAST_ISOTROPY = 0.2
 MOST_CLIPPED = 0.2
 DARKEST_BRIGHT_END = 50
-SUFFIXES = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "TIFF": ".tif", "HEIF": ".heic"}
 
 # Second derivatives along x, mixed, and along y; from their moments follow those along any direction.
 _KERNELS = tuple(
@@ -60,7 +59,7 @@ def judge_photo(path: Path, dictionary: str, others: Others) -> Verdict:
         "suffix": ".bin", "width": None, "height": None, "sharpness": None, "marker_ids": [], "dictionary_seen": None,
     }  # fmt: skip
     try:
-        facts["suffix"] = _suffix(path)
+        facts["suffix"] = photo_suffix(path)
         photo = read_photo(path, AcquisitionSettings())
     except PhotoUnreadableError as error:
         return Verdict("refused", error.code, error.message.replace(path.name, "The photo", 1), error.advice, facts)
@@ -93,17 +92,6 @@ def directional_sharpness(grey: NDArray[np.uint8]) -> tuple[float, float]:
     moments = (maps @ maps.T / maps.shape[1]).astype(float)
     energies = np.einsum("ki,ij,kj->k", _ALONG, moments, _ALONG) / max(float(grey.var()), 1.0)
     return float(energies.min()), float(energies.min() / max(energies.max(), 1e-12))
-
-
-def _suffix(path: Path) -> str:
-    try:
-        with Image.open(path, formats=PHOTO_FORMATS) as opened:
-            return SUFFIXES.get(opened.format or "", ".bin")
-    except Exception as error:
-        # Not a list of types: on damaged files the decoders raise anything.
-        raise PhotoUnreadableError(
-            "The photo is of no known image format.", advice="Give a JPEG, HEIC, PNG or TIFF as the camera made it."
-        ) from error
 
 
 def _blurred(sharpness: float, isotropy: float, others: Sequence[float]) -> Verdict | None:
@@ -147,10 +135,10 @@ def _markers(ids: list[int], grey: NDArray[np.uint8], dictionary: str) -> Verdic
 
 
 def _foreign(size: tuple[int, int], others: Sequence[tuple[int, int]]) -> Verdict | None:
-    """Photos of another camera's size are left out of a job; held upright or across makes no difference."""
-    shapes = Counter(tuple(sorted(other)) for other in others)
-    if len(others) < LEAST_OTHERS or tuple(sorted(size)) in shapes:
+    """Photos of another camera's shape are left out of a job; held upright or across makes no difference, and neither
+    does the resolution where EXIF names the same camera."""
+    if len(others) < LEAST_OTHERS or any(same_shape(size, other) for other in others):
         return None
-    (a, b), _ = shapes.most_common(1)[0]
-    reason = f"It has {size[0]} x {size[1]} pixels, the others {b} x {a}: another camera or zoom."
-    return Verdict("doubtful", "photo_foreign", reason, "Take all photos with one camera at one setting.")
+    (a, b), _ = Counter((max(other), min(other)) for other in others).most_common(1)[0]
+    reason = f"It has {size[0]} x {size[1]} pixels, the others {a} x {b}: another camera, or a part cut out."
+    return Verdict("doubtful", "photo_foreign", reason, "Take all photos with one camera at one setting; do not crop.")

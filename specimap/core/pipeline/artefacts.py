@@ -19,6 +19,7 @@ from specimap.core.acquisition import Refusal
 from specimap.core.adjust import Adjusted
 from specimap.core.files import atomic_path, remove
 from specimap.core.geometry import Floats, Intrinsics, Pose
+from specimap.core.jsontext import json_text
 from specimap.core.reconstruct.backend import CornersInPhotos, Reconstruction
 from specimap.core.reconstruct.depth import DepthMap
 from specimap.core.render import Grid
@@ -64,7 +65,7 @@ class Stage2:
 
 def key_of(stage: str, parts: Mapping[str, object]) -> str:
     """Hash of a stage's name, the program's version and what went into the stage."""
-    text = json.dumps({"stage": stage, "version": __version__, "format": FORMAT, **parts}, sort_keys=True, default=str)
+    text = json_text({"stage": stage, "version": __version__, "format": FORMAT, **parts}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
@@ -82,7 +83,7 @@ class Store:
         """Write an artefact whole or not at all, then drop older ones of the stage."""
         target = self.path(stage, key)
         with atomic_path(target) as aside, open(aside, "wb") as f:
-            np.savez(f, meta=np.array(json.dumps(meta)), **arrays)  # type: ignore[arg-type]
+            np.savez(f, meta=np.array(json_text(meta)), **arrays)  # type: ignore[arg-type]
         for old in self.folder.glob(f"{stage}-*.npz"):
             if old != target:
                 remove(old)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import json
 from collections.abc import Callable
 from dataclasses import asdict, replace
 
@@ -18,7 +17,9 @@ from specimap.core.cloud.writer import write_cloud
 from specimap.core.cloud.written import Written
 from specimap.core.cube import Cube
 from specimap.core.files import write_text
+from specimap.core.gates import gated
 from specimap.core.geometry import Floats, Pose, View
+from specimap.core.jsontext import json_text
 from specimap.core.layout import edge_lengths
 from specimap.core.meshfile import write_mesh_ply
 from specimap.core.pipeline.artefacts import Stage1, Stage2
@@ -77,10 +78,11 @@ def register_and_write(
         points, report = _register(
             stage1, stage2, cube, settings, caster, grids, remarks, inputs, clock, progress
         )
+        report = gated(report, settings.adjust.edge_mm)
         with staged(outputs) as aside:
             write_mesh_ply(aside.mesh, mesh)
             named = zip(adjusted.marker_ids, adjusted.corners, strict=True)
-            write_text(aside.corners, json.dumps({str(i): np.round(c, 6).tolist() for i, c in named}, indent=1))
+            write_text(aside.corners, json_text({str(i): np.round(c, 6).tolist() for i, c in named}, indent=1))
 
             def attributes(written: Written) -> dict[str, object]:
                 nonlocal report

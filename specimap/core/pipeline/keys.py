@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import asdict
 
+from specimap.core.jsontext import json_text
 from specimap.core.pipeline.artefacts import key_of
 from specimap.core.pipeline.settings import PipelineSettings
 from specimap.core.reconstruct.learned.environment import backend_identity
@@ -43,4 +43,4 @@ def register_key(render: str, cube: str, settings: PipelineSettings) -> str:
 
 def digest_of(photos: Mapping[str, str]) -> str:
     """One hash for all photos."""
-    return hashlib.sha256(json.dumps(dict(photos), sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json_text(dict(photos), sort_keys=True).encode()).hexdigest()

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from specimap.core.acquisition import RECOMMENDED_PHOTOS
 from specimap.core.adjust import Adjusted
+from specimap.core.layout import edge_lengths
 from specimap.core.pipeline.artefacts import Stage1
+from specimap.core.pipeline.scale import PLAUSIBLE_DISTANCE_MM, disagrees, likely_unit, reach_mm
 from specimap.core.register.cube_markers import CubeMarkers
-
-SUBJECT_DISAGREES = 2.0
-PLAUSIBLE_DISTANCE_MM = (50.0, 1200.0)
-"""A phone does not focus nearer; and nobody photographs a specimen between markers from farther."""
 
 
 def remarks_of(stage1: Stage1, adjusted: Adjusted, found: CubeMarkers) -> list[tuple[str, str]]:
@@ -30,19 +26,17 @@ def remarks_of(stage1: Stage1, adjusted: Adjusted, found: CubeMarkers) -> list[t
         remarks.append(
             ("cube_mirrored", "The cube is mirrored, as its markers show; columns were counted from the other side.")
         )
-    distance = float(np.median([p.centre[2] for p in adjusted.poses]))
-    reach = [float(np.linalg.norm(p.centre)) for p in adjusted.poses]
-    low, high = PLAUSIBLE_DISTANCE_MM
-    if not low < np.median(reach) < high:
+    reach = reach_mm(adjusted.poses, adjusted.corners)
+    if not PLAUSIBLE_DISTANCE_MM[0] < reach < PLAUSIBLE_DISTANCE_MM[1]:
         remarks.append(
-            ("scale_implausible", f"With this marker edge the photos were taken {distance:.0f} mm above the markers.")
-        )
-    if stage1.subject_mm:
-        ratio = float(np.median(reach)) / stage1.subject_mm
-        if not 1 / SUBJECT_DISAGREES < ratio < SUBJECT_DISAGREES:
-            remarks.append(
-                ("scale_contradicts_exif",
-                 f"The photos' EXIF says {stage1.subject_mm:.0f} mm to the subject, the marker edge "
-                 f"{np.median(reach):.0f} mm: check the edge.")
-            )  # fmt: skip
+            ("scale_implausible",
+             f"With this marker edge the photos were taken {reach:.0f} mm from the markers"
+             f"{likely_unit(edge_lengths(adjusted.corners).mean(), reach)}.")
+        )  # fmt: skip
+    if disagrees(reach, stage1.subject_mm):
+        remarks.append(
+            ("scale_contradicts_exif",
+             f"The photos' EXIF says {stage1.subject_mm:.0f} mm to the subject, the marker edge "
+             f"{reach:.0f} mm: check the edge.")
+        )  # fmt: skip
     return remarks

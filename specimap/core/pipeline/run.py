@@ -10,6 +10,7 @@ from pathlib import Path
 
 from specimap.core.acquisition import photo_paths
 from specimap.core.cube import inspect, open_cube
+from specimap.core.photofolder import photo_folder
 from specimap.core.pipeline.artefacts import load_stage2
 from specimap.core.pipeline.clock import STAGES, Clock, Progress
 from specimap.core.pipeline.keys import digest_of, register_key, surface_keys
@@ -48,7 +49,7 @@ def run_pipeline(
         fingerprint = background.submit(cube.fingerprint)
         # Inspecting it early refuses a useless cube before minutes of work.
         mean = cube.mean_image()
-        remarks = [*cube.warnings, *inspect(cube, mean)]
+        remarks = [*cube.warnings, *inspect(cube, mean), *photo_folder(inputs.photos).remarks()]
         with ThreadPoolExecutor(workers) as pool:
             digests = {p.name: d for p, d in zip(paths, pool.map(_digest, paths), strict=True)}
         keys, store = surface_keys(digests, settings), outputs.store

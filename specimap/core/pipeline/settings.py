@@ -9,6 +9,7 @@ from specimap.core.acquisition import AcquisitionSettings
 from specimap.core.adjust import AdjustSettings, Form
 from specimap.core.errors import SettingsError
 from specimap.core.fiducials import dictionary_named
+from specimap.core.limits import RANGES, advice_on
 from specimap.core.reconstruct.backend import FeatureChoice, ReconstructSettings
 from specimap.core.reconstruct.depth import DepthSettings, Device
 from specimap.core.reconstruct.learned.environment import DEVICES, dense_device
@@ -43,18 +44,20 @@ class PipelineSettings:
             UnknownDictionaryError: there is no such marker dictionary.
         """
         dictionary_named(self.reconstruct.dictionary)
-        positive = {
+        numbers: dict[str, float | None] = {
             "edge_mm": self.adjust.edge_mm,
             "r_reg": self.render.r_reg_mm,
             "r_pc": self.render.r_pc_mm,
             "working_px": self.acquisition.working_px,
-            "voxel_mm": self.surface.voxel_mm or 1.0,
+            "voxel_mm": self.surface.voxel_mm,
         }
-        for name, value in positive.items():
-            if not 0 < value < 1e6:
+        for name, value in numbers.items():
+            low, high = RANGES[name]
+            if value is not None and not low <= value <= high:
                 raise SettingsError(
-                    f"{name} is {value}; it must be above 0.", advice="Give a positive number.", setting=name
-                )
+                    f"{name} is {value:g}; it must be from {low:g} to {high:g}.", advice=advice_on(name, value),
+                    setting=name,
+                )  # fmt: skip
         choices = {
             "backend": (self.reconstruct.backend, BACKENDS),
             "features": (self.reconstruct.features, FEATURES),

@@ -25,7 +25,9 @@ from specimap.core.pipeline.artefacts import (
     save_stage2,
 )
 from specimap.core.pipeline.clock import Clock
+from specimap.core.pipeline.scale import check_scale
 from specimap.core.pipeline.settings import PipelineSettings
+from specimap.core.pipeline.strays import without_strays
 from specimap.core.points import worth_refining
 from specimap.core.raycast import RayCaster
 from specimap.core.reconstruct.backend import ReconstructionBackend, corners_in_photos, detect_in_photos
@@ -86,6 +88,9 @@ def reconstruct_stage(
         photos, corners, zooms = settle_breathing(
             photos, corners, edge_mm=settings.adjust.edge_mm, focal_px=stated_focal_px(photos), workers=workers
         )
+        if corners.solution is not None:
+            scene = corners.solution.scene
+            check_scale(scene.poses, scene.corners, settings, _subject_mm(photos))
         reconstruction = backend.reconstruct(
             photos,
             corners,
@@ -93,6 +98,7 @@ def reconstruct_stage(
             workers=workers,
             progress=lambda s: progress(0.2 + 0.8 * s),
         )
+        reconstruction = without_strays(reconstruction, corners, tuple(p.name for p in photos))
         if (zooms != 1).any():
             remark = "focal_breathing", f"The photos' focal lengths differ by {100 * zooms.std():.1f} % " + (
                 "(standard deviation); each photo was brought to the one they share."
@@ -133,6 +139,7 @@ def adjust_stage(
         posed = seen.of(np.isin(seen.photo, r.photos))
         posed = replace(posed, photo=np.array([place[int(p)] for p in posed.photo]))
         adjusted = adjust(r.lens, r.poses, posed, stage1.corners.marker_ids, settings.adjust)
+        check_scale(adjusted.poses, adjusted.corners, settings, stage1.subject_mm)
         maps = tuple(replace(m, depth=m.depth * np.float32(adjusted.scale)) for m in r.maps)
         refined = mesh_of(
             maps, list(stage1.greys), adjusted.lens, adjusted.poses, adjusted.corners, settings,
@@ -156,7 +163,7 @@ def mesh_of(
     progress: Callable[[float], None] = lambda share: None,
 ) -> Refined:
     """Depth maps in mm to a mesh refined on the photos' ``greys``; all in the frame of ``poses`` and ``corners``."""
-    pixel_mm = pixel_footprint_mm(lens, poses, volume_over(corners).centre)
+    pixel_mm = pixel_footprint_mm(lens, poses, volume_over(corners, poses).centre)
     shrinkage = settings.reconstruct.depth.shrinkage(lens)
     voxel_mm = settings.surface.voxel_mm or VOXEL_PIXELS * pixel_mm / shrinkage
     fused = fuse(list(maps), poses, voxel_mm, settings.surface, progress=lambda s: progress(0.4 * s))

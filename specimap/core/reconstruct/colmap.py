@@ -39,7 +39,7 @@ class ColmapBackend:
             [photos[p].image for p in posed.photos],
             posed.lens,
             posed.poses,
-            volume_over(posed.corners),
+            volume_over(posed.corners, posed.poses),
             settings.depth,
             workers=workers,
             progress=lambda share: progress(0.15 + 0.85 * share),

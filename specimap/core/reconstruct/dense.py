@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
+from specimap.core.errors import DepthNotFoundError
 from specimap.core.geometry import Floats, Intrinsics, Pose
 from specimap.core.reconstruct.depth import (
     Bytes,
@@ -19,10 +20,16 @@ from specimap.core.reconstruct.depth import (
     before_shrinking,
     choose_pairs,
     match_pair,
+    shared_share,
 )
 
 COARSE_PX = 256
 COARSE_PAIRS = 10
+LEAST_MAPS = 2
+LEAST_MAPS_SHARE = 0.05
+"""Of the pairs; with fewer, what a place shows rests on one pair alone."""
+LEAST_SHARED = 0.3
+"""Of what one photo of a pair shows: below, the pair says little about depth."""
 COARSE_CELLS = 40
 """Cells of the coarse grid along the volume's diagonal."""
 
@@ -89,11 +96,18 @@ def dense_depth(
     workers: int,
     progress: Callable[[float], None] = lambda share: None,
 ) -> list[DepthMap]:
-    """Depth maps of all pairs; ``images``: posed photos (H, W, 3), in the order of ``poses``. None where no two photos
-    look from directions that can be matched."""
+    """Depth maps of all pairs; ``images``: posed photos (H, W, 3), in the order of ``poses``.
+
+    Raises:
+        DepthNotFoundError: hardly a pair gives depth; the message says why.
+    """
     pairs = choose_pairs(poses, volume.centre, settings)
-    if not pairs:
-        return []
+    if len(pairs) < LEAST_MAPS:
+        raise DepthNotFoundError(
+            f"No two of the {len(poses)} photos look at the markers from directions 4 to 42 degrees apart.",
+            advice="Take photos all around, neighbours 10 to 20 degrees apart and about equally far away.",
+            photos=len(poses),
+        )
     content = find_content(images, lens, poses, volume, pairs, settings, workers)
     shrinkage = settings.shrinkage(lens)
     images = [before_shrinking(image, shrinkage) for image in images]
@@ -110,4 +124,28 @@ def dense_depth(
             if depth_map is not None:
                 maps.append(depth_map)
             progress(done / len(pairs))
+    if len(maps) < max(LEAST_MAPS, LEAST_MAPS_SHARE * len(pairs)):
+        raise _not_found(lens, poses, volume, pairs, len(maps))
     return maps
+
+
+def _not_found(
+    lens: Intrinsics, poses: tuple[Pose, ...], volume: Volume, pairs: list[tuple[int, int]], found: int
+) -> DepthNotFoundError:  # fmt: skip
+    """Why hardly a pair gave depth: they do not show the same, or nothing in them matches."""
+    details = {"photos": len(poses), "pairs": len(pairs), "pairs_with_depth": found}
+    apart = sum(shared_share(lens, poses[i], poses[j], volume.lattice) < LEAST_SHARED for i, j in pairs)
+    if apart > len(pairs) / 2:
+        height = float(np.median([p.centre[2] for p in poses]))
+        width = float(np.ptp(volume.vertices[:, :2], axis=0).max())
+        return DepthNotFoundError(
+            f"{apart} of {len(pairs)} pairs of neighbouring photos show too little in common: the cameras stood "
+            f"{height:.0f} mm above markers that span {width:.0f} mm.",
+            advice="Take the photos from farther away, so that each shows most of the markers with the specimen.",
+            **details,
+        )
+    return DepthNotFoundError(
+        f"Hardly anything matches between neighbouring photos: {found} of {len(pairs)} pairs gave depth.",
+        advice="Take sharp photos in even light; put the specimen on a patterned surface, and dab off what glistens.",
+        **details,
+    )

@@ -14,12 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specimap.core.geometry import Floats, Intrinsics, Pose, View
+from specimap.core.reconstruct.volume import Singles as Singles
+from specimap.core.reconstruct.volume import Volume as Volume
+from specimap.core.reconstruct.volume import inside_volume as inside_volume
+from specimap.core.reconstruct.volume import lattice_over
+from specimap.core.reconstruct.volume import volume_over as volume_over
 
 MOST_DISPARITIES = 512
 OWN_BLUR_PX = 0.5
+NEAREST_SHARE = 0.05
+"""Of the farthest depth: what is nearer, or behind, a camera does not see sharply."""
+LEAST_SHOWN = 4
+"""Points of a box that two photos must share."""
 
 Bytes = NDArray[np.uint8]
-Singles = NDArray[np.float32]
 Device = Literal["auto", "cpu", "gpu"]
 
 
@@ -61,25 +69,6 @@ def before_shrinking(image: Bytes, factor: float) -> Bytes:
 
 
 @dataclass(frozen=True)
-class Volume:
-    """The box in the marker frame, mm, in which a surface is looked for: low (3,), high (3,)."""
-
-    low: Floats
-    high: Floats
-
-    @property
-    def vertices(self) -> Floats:
-        """The eight corners, (8, 3)."""
-        return np.array([[x, y, z] for x in (self.low[0], self.high[0]) for y in (self.low[1], self.high[1])
-                         for z in (self.low[2], self.high[2])])  # fmt: skip
-
-    @property
-    def centre(self) -> Floats:
-        """(3,) mm."""
-        return (self.low + self.high) / 2
-
-
-@dataclass(frozen=True)
 class DepthMap:
     """Depth of one photo, in a virtual camera at the photo's place.
 
@@ -106,21 +95,6 @@ class DepthMap:
         rows, cols = rows[::step], cols[::step]
         cam = self.intrinsics.rays(np.stack([cols, rows], -1).astype(float)) * self.depth[rows, cols, None]
         return self.view(pose).cam_from_world.inverse().apply(cam)
-
-
-def volume_over(corners: Floats, *, height_share: float = 0.35, below_mm: float = 2.0) -> Volume:
-    """The box over the markers' corners (Q, 4, 3), as high as ``height_share`` of the layout's diagonal.
-
-    It reaches a third of a marker's edge beyond the corners, so that whole cards lie in it.
-    """
-    points = corners.reshape(-1, 3)
-    margin = np.array([1.0, 1.0, 0.0]) * np.linalg.norm(corners[:, 0] - corners[:, 1], axis=-1).mean() / 3
-    low, high = points.min(0) - margin, points.max(0) + margin
-    diagonal = float(np.linalg.norm((high - low)[:2]))
-    return Volume(
-        np.array([low[0], low[1], low[2] - below_mm]),
-        np.array([high[0], high[1], high[2] + height_share * diagonal]),
-    )
 
 
 def choose_pairs(poses: tuple[Pose, ...], target: Floats, settings: DepthSettings) -> list[tuple[int, int]]:
@@ -166,6 +140,17 @@ class _Rectified:
     range_px: tuple[int, int]
 
 
+def _shown(points: Floats, lens: Intrinsics, pose: Pose) -> NDArray[np.bool_]:
+    """Which points (N, 3) lie before a camera and in its picture, distortion aside."""
+    cam = pose.apply(points)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = (lens.focal_px * cam[:, k] / cam[:, 2] for k in (0, 1))
+    inside = (np.abs(u + lens.cx - lens.width / 2) < lens.width / 2) & (
+        np.abs(v + lens.cy - lens.height / 2) < lens.height / 2
+    )
+    return np.asarray((cam[:, 2] > 0) & inside, bool)
+
+
 def _rectify(lens: Intrinsics, first: Pose, second: Pose, content: Floats, shrinkage: float) -> _Rectified | None:
     """Virtual cameras for a pair, cut to where ``content`` (N, 3) shows, ``shrinkage`` as large as the photos; None
     where it cannot be rectified."""
@@ -178,10 +163,17 @@ def _rectify(lens: Intrinsics, first: Pose, second: Pose, content: Floats, shrin
         return None
     z = z / np.linalg.norm(z)
     R = np.stack([x, np.cross(z, x), z])
-    cam = (content - first.centre) @ R.T
-    if cam[:, 2].min() <= 0.05 * cam[:, 2].max():
-        return None
     focal_px = shrinkage * lens.focal_px
+    cam = (content - first.centre) @ R.T
+    if cam[:, 2].min() <= NEAREST_SHARE * cam[:, 2].max():
+        # A camera among the content: what it can see of the content's box, as near as disparities go.
+        box = lattice_over(content.min(0), content.max(0))
+        cam = (box[_shown(box, lens, first) & _shown(box, lens, second)] - first.centre) @ R.T
+        farthest = float(cam[:, 2].max(initial=0))
+        nearest = focal_px * length / (MOST_DISPARITIES - 32 + focal_px * length / max(farthest, 1e-9))
+        cam = cam[cam[:, 2] > max(nearest, NEAREST_SHARE * farthest)]
+    if len(cam) < LEAST_SHOWN:
+        return None
     pixels = focal_px * cam[:, :2] / cam[:, 2:]
     most = 1.3 * shrinkage * np.array([lens.width, lens.height])
     low, high = np.maximum(pixels.min(0), -most), np.minimum(pixels.max(0), most)
@@ -205,6 +197,12 @@ def _warp(image: Bytes, lens: Intrinsics, turn: Floats, virtual: Intrinsics, shi
         lens.matrix, lens.distortion, turn, matrix, (virtual.width, virtual.height), cv2.CV_32FC1
     )
     return np.asarray(cv2.remap(image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT))
+
+
+def shared_share(lens: Intrinsics, first: Pose, second: Pose, content: Floats) -> float:
+    """Share of ``content`` (N, 3) that a second photo shows, of what the first one does."""
+    seen = _shown(content, lens, first)
+    return float((_shown(content, lens, second) & seen).sum() / max(int(seen.sum()), 1))
 
 
 def match_pair(
@@ -271,13 +269,3 @@ def cropped_map(
     sure = np.full(depth.shape, 255, np.uint8) if confidence is None else confidence
     sure = np.where(part > 0, sure[top:bottom, left:right], 0).astype(np.uint8)
     return DepthMap(photo, turn, lens, part, sure, np.ascontiguousarray(colour[top:bottom, left:right]))
-
-
-def inside_volume(depth: Singles, virtual: Intrinsics, R: Floats, pose: Pose, volume: Volume) -> Singles:
-    """Depths whose points lie outside the volume become 0."""
-    v, u = np.indices(depth.shape, dtype=np.float32)
-    rays = np.stack([(u - virtual.cx) / virtual.focal_px, (v - virtual.cy) / virtual.focal_px,
-                     np.ones_like(u)], -1)  # fmt: skip
-    points = (rays * depth[..., None]) @ R.astype(np.float32) + pose.centre.astype(np.float32)
-    keep = ((points >= volume.low) & (points <= volume.high)).all(-1)
-    return np.where(keep, depth, 0).astype(np.float32)

@@ -13,6 +13,7 @@ from sqlalchemy.orm import Session
 from specimap.infra.database import utc_now
 from specimap.infra.errors import JobConflictError
 from specimap.infra.ids import new_id
+from specimap.infra.job_models import EdgeMm
 from specimap.infra.models import FINAL_STATES, Acquisition, Job, StoredFile, Upload
 from specimap.infra.readiness import missing
 from specimap.service.auth import Admin, Reader, Uploader
@@ -38,7 +39,7 @@ class AcquisitionRequest(BaseModel):
     specimen_id: Pseudonym = Field(description="Pseudonym of the specimen: letters, digits, dot, dash, underscore.")
     accession_number: Pseudonym | None = Field(None, description="Pseudonymous too, for finding it again.")
     dictionary: Dictionary = Field("DICT_4X4_50", description="ArUco dictionary of the marker cards.")
-    edge_mm: float = Field(6.8, gt=0, le=1000, allow_inf_nan=False, description="Edge of a marker's black square.")
+    edge_mm: EdgeMm = 6.8
     notes: Annotated[str, StringConstraints(max_length=2000, pattern=r"^[^\x00]*$")] = Field(
         "", description="About the capture; no patient's data."
     )

@@ -11,6 +11,7 @@ from fastapi import APIRouter, Request, Response
 from sqlalchemy.orm import Session
 
 from specimap.core.errors import NotFoundError
+from specimap.core.photoformats import MEDIA_TYPES
 from specimap.infra.errors import QuotaExceededError, RequestInvalidError
 from specimap.infra.ids import new_id
 from specimap.infra.models import Acquisition, StoredFile
@@ -35,8 +36,6 @@ from specimap.service.routers.uploads import Files
 
 router = APIRouter(prefix="/v1", tags=["files"])
 DISK_EVERY = 64 * 1024 * 1024
-MEDIA_TYPES = {".jpg": "image/jpeg", ".png": "image/png", ".tif": "image/tiff", ".heic": "image/heic"}
-"""What a browser may show; all else is a download of octets."""
 FORM: dict[str, Any] = {
     "requestBody": {
         "required": True,

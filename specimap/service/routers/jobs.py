@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import AsyncIterator
 from typing import Annotated, Any
 
@@ -12,6 +11,7 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.sse import KEEPALIVE_COMMENT, EventSourceResponse, format_sse_event
 
 from specimap.core.errors import NotFoundError
+from specimap.core.jsontext import json_text
 from specimap.core.report import Report
 from specimap.infra.errors import JobConflictError
 from specimap.infra.job_models import JobState, JobView, job_views
@@ -204,4 +204,4 @@ async def _encoded(context: AppContext, job_id: str, after: int) -> AsyncIterato
         if event is None:
             yield KEEPALIVE_COMMENT
         else:
-            yield format_sse_event(data_str=json.dumps(event.data), event=event.type, id=str(event.seq))
+            yield format_sse_event(data_str=json_text(event.data), event=event.type, id=str(event.seq))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable
 from typing import Annotated, Any
 
@@ -12,6 +11,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from specimap import __version__
 from specimap.core.cloud import Cloud
 from specimap.core.errors import NotFoundError
+from specimap.core.jsontext import json_text
 from specimap.infra.errors import RequestInvalidError
 from specimap.service import pictures
 from specimap.service.auth import Reader
@@ -205,7 +205,7 @@ def _picture(
     """The answer; ``parameters`` are all that the picture depends on beside cloud, grid and size."""
     context.clouds.record(cloud_id)
     # A cloud never changes: what it is drawn from, and by which program, says which picture it is.
-    told = json.dumps([__version__, cloud_id, grid, size, *parameters])
+    told = json_text([__version__, cloud_id, grid, size, *parameters])
     tag = hashlib.sha256(told.encode()).hexdigest()[:32]
     headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache", "Vary": "Authorization"}
     known = [part.strip().removeprefix("W/") for part in request.headers.get("if-none-match", "").split(",")]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Annotated, Any
 
 import numpy as np
@@ -12,6 +11,7 @@ from starlette.responses import Response
 from specimap.core.cloud import Cloud
 from specimap.core.errors import NotFoundError
 from specimap.core.geometry import Array
+from specimap.core.jsontext import json_text
 from specimap.service.answers import ARROW, JSON, NPY, arrow_answer, chosen_type, documented, json_answer, npy_answer
 from specimap.service.auth import Reader
 from specimap.service.bodies import parsed
@@ -186,4 +186,4 @@ def _metadata(record: CloudRecord, **values: Any) -> dict[str, str]:
         name: [v if np.isfinite(v) else None for v in value.tolist()] if isinstance(value, np.ndarray) else value
         for name, value in values.items()
     }
-    return {"cloud_id": record.id, **{k: v if isinstance(v, str) else json.dumps(v) for k, v in ready.items()}}
+    return {"cloud_id": record.id, **{k: v if isinstance(v, str) else json_text(v) for k, v in ready.items()}}

@@ -12,6 +12,7 @@ from specimap.core.cloud import ARRAYS
 from specimap.core.cloud.shards import damage
 from specimap.core.cloud.source import ByteSource
 from specimap.core.errors import NotFoundError
+from specimap.core.jsontext import json_text
 from specimap.infra.storage import Storage
 from specimap.service.auth import Reader
 from specimap.service.clouds import CloudRecord, StoredFolder
@@ -91,7 +92,7 @@ def _group_document(storage: Storage, record: CloudRecord, *, labels: bool) -> b
         if own:
             members |= {"labels": GROUP, **{f"labels/{name}": found for name, found in own.items()}}
     document["consolidated_metadata"] = {"kind": "inline", "must_understand": False, "metadata": members}
-    return json.dumps(document).encode()
+    return json_text(document).encode()
 
 
 def _document(source: ByteSource, key: str) -> dict[str, Any]:

@@ -72,7 +72,7 @@ class Da3Backend:
             photos, corners, settings, workers=workers, progress=lambda share: progress(0.1 * share)
         )
         progress(0.1)
-        volume = volume_over(posed.corners)
+        volume = volume_over(posed.corners, posed.poses)
         shown = [photos[p] for p in posed.photos]
         preparation = plan_preparation(posed.lens, own.size_px)
         images = np.stack([preparation.apply(photo.image) for photo in shown])

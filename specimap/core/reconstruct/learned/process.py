@@ -27,6 +27,7 @@ from specimap.core import errors
 from specimap.core.errors import BackendFailedError, BackendUnavailableError, SpecimapError
 from specimap.core.files import disk_errors
 from specimap.core.geometry import Array
+from specimap.core.jsontext import json_text
 from specimap.core.reconstruct.learned import child
 from specimap.core.reconstruct.learned.environment import bare_environment
 
@@ -82,7 +83,7 @@ def run_child(
         with disk_errors(folder):
             given = {"script": str(script), "extra_path": [str(p) for p in extra_path],
                      "request": {**request, "folder": str(folder)}}  # fmt: skip
-            (folder / child.REQUEST).write_text(json.dumps(given, default=str), "utf-8")
+            (folder / child.REQUEST).write_text(json_text(given), "utf-8")
             np.savez(folder / child.ARRAYS, allow_pickle=False, **arrays)
         facts = _Child(name, folder, python or sys.executable, environment or {}).answer(steps, progress)
         with np.load(folder / child.ANSWER, allow_pickle=False) as stored:

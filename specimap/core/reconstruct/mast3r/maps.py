@@ -31,7 +31,7 @@ def depth_maps(
     Raises:
         DepthNotFoundError: nothing is left.
     """
-    volume = volume_over(metric.corners)
+    volume = volume_over(metric.corners, [metric.poses[p] for p in used])
     straight = replace(lens, k1=0.0, k2=0.0)
     maps = []
     for place, photo in enumerate(used):
