@@ -29,6 +29,9 @@ TILE_MM, LEAST_TILE_MM = 0.1, 0.03
 """Standard deviation of a tile's place at first, and the least that is believed."""
 LEAST_TILES = 5
 LOOKS = 3
+UNFIT, UNFIT_MM = 3.0, 0.05
+"""Corners that lie so much farther than they should from where the best camera sees them, and farther than this, fit
+no camera."""
 SETTLED_MM = 0.02
 """Looks end when the specimen's expected place changes by less."""
 OPEN = 9.0
@@ -49,6 +52,13 @@ class Choice:
     moved: bool
     sighting: Sighting | None
     open_mm: float
+
+    @property
+    def unfit_mm(self) -> float:
+        """How far the corners lie from where the best camera sees them, where that is more than it may be, else 0."""
+        camera = self.alone.camera
+        scatter_mm = camera.rms_px * camera.pixel_mm * self.alone.spared
+        return scatter_mm if self.alone.scatter > UNFIT and scatter_mm > UNFIT_MM else 0.0
 
     @property
     def by_specimen(self) -> bool:
@@ -150,7 +160,7 @@ def _open_mm(fits: dict[tuple[Model, bool], Fit], best: tuple[Model, bool], plac
     tissue = len(fits[best].tile_miss) > 0
     for key, other in fits.items():
         ahead = fits[best].cost - other.cost
-        if key[0] is best[0] or key[1] or ahead < -OPEN or (best[0] is FRAME and (not tissue or ahead < OPEN)):
+        if key[0] is best[0] or key[1] != best[1] or ahead < -OPEN or (best[0] is FRAME and (not tissue or ahead < 0)):
             continue
         share = 1 / (1 + np.exp(np.clip(-ahead / 2, -30, 30)))
         variance = max(variance, share * _apart_mm(fits[best].camera, other.camera.view, places) ** 2)

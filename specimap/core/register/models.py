@@ -31,7 +31,7 @@ SKEW_SD = 0.05
 """Of a scan's motion from square to its line, rad."""
 ASPECT_RANGE = (0.25, 4.0)
 """Heights over widths of a pixel that are believed."""
-PRICED = 12.0
+PRICED = 8.0
 """How much better than a frame camera of square pixels another must explain what is seen, in chi squared."""
 NUMBERS = 10
 STEPS = np.array([1e-3] * 3 + [1.0] * 3 + [0.1, 0.01, 0.01, 0.01])

@@ -23,7 +23,7 @@ from specimap.core.register.choose import Choice, choose_camera
 from specimap.core.register.cube_markers import CubeMarkers
 from specimap.core.register.fitting import Sight
 from specimap.core.register.models import FRAME
-from specimap.core.register.motion import LEAST_MARKERS, SHARED_MM, Shift, shift_of
+from specimap.core.register.motion import LEAST_MARKERS, Shift, shift_of
 from specimap.core.register.sighting import Sighting, sight_specimen
 from specimap.core.scan import ScanView
 
@@ -31,9 +31,10 @@ LOOSE_MM = 0.1
 """Sideways standard deviation at the specimen from which on the result is called loose."""
 EXPLAINED_BY_CAMERA = 3.0
 """A shift within so many standard deviations of the camera is the camera's, not the specimen's."""
-UNFIT = 3.0
-UNFIT_MM = 0.05
-"""Corners that lie farther from where the best camera sees them, and so many times farther than they should, are said."""
+JOINT_MM = 0.03
+"""What all tiles are off together, one standard deviation, where they settle more of a camera than its middle."""
+MOVED_OVER_UNFIT = 3.0
+"""A motion is told from a cube that no camera fits where it is so many times more than the corners are off."""
 SQUARE = 0.005
 """An aspect nearer to 1 than this is not worth a word."""
 ROUNDS = 3
@@ -63,7 +64,7 @@ class Settled:
     @property
     def moved(self) -> bool:
         """Whether the specimen lies elsewhere in the cube than in the photos."""
-        return self.shift is not None and self.shift.significant and self.shift.moved_mm > UNFIT * self.unfit_mm
+        return self.shift is not None and self.shift.significant and self.shift.moved_mm > MOVED_OVER_UNFIT * self.unfit_mm
 
     @property
     def sideways_mm(self) -> float:
@@ -127,15 +128,15 @@ def settle_camera(
         return sight_specimen(found.image, view, caster, corners, mirrored=found.mirrored)
 
     choice = choose_camera(Sight(*flat), rows, cols, square, sample, sight)
-    if choice.model is FRAME and square is not None:
+    if choice.model is FRAME and square is not None and not choice.unfit_mm:
         return _settle_square(square, choice, seen, rows, cols, sample, sight)
     camera, alone = choice.fit.camera, choice.alone.camera
     if not len(sample):
-        return Settled(camera, alone.sideways_mm(flat[0]), False, None, unfit_mm=_unfit_mm(choice))
+        return Settled(camera, alone.sideways_mm(flat[0]), False, None, unfit_mm=choice.unfit_mm)
     left_open = alone.sideways_mm(sample)
-    joint_mm = float(np.hypot(camera.sideways_mm(sample), SHARED_MM)) if choice.by_specimen else None
+    joint_mm = float(np.hypot(camera.sideways_mm(sample), JOINT_MM)) if choice.by_specimen else None
     shift = shift_of(last) if choice.moved and (last := sight(camera.view)) is not None else None
-    return Settled(camera, left_open, choice.by_specimen, shift, joint_mm, choice.open_mm, _unfit_mm(choice))
+    return Settled(camera, left_open, choice.by_specimen, shift, joint_mm, choice.open_mm, choice.unfit_mm)
 
 
 def _settle_square(
@@ -145,7 +146,7 @@ def _settle_square(
     """A frame camera of square pixels: by its markers, or with the specimen's middle where they leave it open."""
     flat, markers = seen.flat(), len(seen.marker_ids)
     if not len(sample):
-        return Settled(camera, camera.sideways_mm(flat[0]), False, None, unfit_mm=_unfit_mm(choice))
+        return Settled(camera, camera.sideways_mm(flat[0]), False, None)
     centre, left_open, settled = sample.mean(0), camera.sideways_mm(sample), False
 
     def look(camera: CubeCamera) -> Shift | None:
@@ -169,18 +170,11 @@ def _settle_square(
             break
     if not settled and markers < LEAST_MARKERS:
         shift = None
-    unfit_mm = _unfit_mm(choice)
+    unfit_mm = 0.0
     if shift is not None and shift.significant and choice.by_specimen and not choice.moved:
         # Tiles lie elsewhere, but not as those of something that moved as a whole.
-        unfit_mm, shift = float(np.hypot(unfit_mm, shift.moved_mm)), None
+        unfit_mm, shift = shift.moved_mm, None
     return Settled(camera, left_open, settled, shift, kinds_mm=choice.open_mm, unfit_mm=unfit_mm)
-
-
-def _unfit_mm(choice: Choice) -> float:
-    """How far the corners lie from where the best camera sees them, where that is more than it may be."""
-    fitted = choice.alone
-    scatter_mm = fitted.camera.rms_px * fitted.camera.pixel_mm * fitted.spared
-    return scatter_mm if fitted.scatter > UNFIT and scatter_mm > UNFIT_MM else 0.0
 
 
 def _apart_mm(before: CubeCamera, after: CubeCamera, point: Floats) -> float:

@@ -10,10 +10,10 @@ from specimap.core.robust import SIGMA_OF_MAD
 
 WIDEST_PX = 9
 """Widest stripe that is told from what the image shows."""
-UNLIKE = 12.0
-"""A line is a stripe where most of it differs from its surroundings by so many usual differences."""
-MOST = 0.7
-"""Part of a line that must differ to the same side: no edge of anything follows a line so far."""
+UNLIKE = 3.0
+"""A line is a stripe where most of it differs from its surroundings by so many usual differences, to one side."""
+MOST = 0.6
+"""How much of it must: on phantoms no line differs so over more than 0.17 of its length, dead ones over all of it."""
 
 
 def without_stripes(image: NDArray[np.float32]) -> NDArray[np.float32]:
