@@ -27,6 +27,9 @@ MOTION_PRICED = 20.0
 """How much better a specimen that moved must explain what is seen, in chi squared."""
 TILE_MM, LEAST_TILE_MM = 0.1, 0.03
 """Standard deviation of a tile's place at first, and the least that is believed."""
+SHARED_BY_TILES = 3.0
+"""How much less sure a tile is where a camera is measured by it than where kinds are compared: the surface is off by as
+much over several tiles alike, which their scatter does not show."""
 LEAST_TILES = 5
 LOOKS = 3
 UNFIT, UNFIT_MM = 3.0, 0.05
@@ -36,6 +39,9 @@ SETTLED_MM = 0.02
 """Looks end when the specimen's expected place changes by less."""
 OPEN = 9.0
 """A kind that explains less by no more than this, in chi squared, is not ruled out."""
+DOUBTED = 3.0
+"""A frame camera of square pixels is in doubt where another explains more by this: numbers that it lacks explain one or
+two by chance."""
 
 Look = Callable[[View], Sighting | None]
 
@@ -95,7 +101,10 @@ def choose_camera(sight: Sight, rows: int, cols: int, square: CubeCamera | None,
         if not len(places) or _apart_mm(now[best].camera, through, places) < SETTLED_MM:
             break
     model, moved = best
-    return Choice(model, now[best], alone[model], moved, seen, _open_mm(now, best, places))
+    taken = now[best]
+    if taken.sight.tissue is not None:
+        taken = fit(taken.camera.view, model, taken.sight.with_looser_tissue(SHARED_BY_TILES), motion=moved)
+    return Choice(model, taken, alone[model], moved, seen, _open_mm(now, best, places))
 
 
 def _starts(sight: Sight, rows: int, cols: int, square: CubeCamera | None) -> dict[Model, View]:
@@ -160,7 +169,7 @@ def _open_mm(fits: dict[tuple[Model, bool], Fit], best: tuple[Model, bool], plac
     tissue = len(fits[best].tile_miss) > 0
     for key, other in fits.items():
         ahead = fits[best].cost - other.cost
-        if key[0] is best[0] or key[1] != best[1] or ahead < -OPEN or (best[0] is FRAME and (not tissue or ahead < 0)):
+        if key[0] is best[0] or key[1] != best[1] or ahead < -OPEN or (best[0] is FRAME and (not tissue or ahead < DOUBTED)):
             continue
         share = 1 / (1 + np.exp(np.clip(-ahead / 2, -30, 30)))
         variance = max(variance, share * _apart_mm(fits[best].camera, other.camera.view, places) ** 2)

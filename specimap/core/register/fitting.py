@@ -58,6 +58,11 @@ class Sight:
         """The same with corners less sure."""
         return replace(self, sigma_px=self.sigma_px * factor)
 
+    def with_looser_tissue(self, factor: float) -> Sight:
+        """The same with the specimen's tiles less sure."""
+        tissue = self.tissue
+        return self if tissue is None else replace(self, tissue=replace(tissue, sigma_px=tissue.sigma_px * factor))
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -67,6 +72,7 @@ class Fit:
     in theirs."""
 
     camera: CubeCamera
+    sight: Sight
     cost: float
     motion: Floats
     scatter: float
@@ -131,4 +137,4 @@ def fit(start: View, model: Model, sight: Sight, *, motion: bool = False, held: 
     )  # fmt: skip
     shift = x[free:] if motion else np.zeros(3)
     tiles = tissue.miss(base, shift) if tissue is not None else np.empty((0, 2))
-    return Fit(camera, float(2 * answer.cost), shift, float(np.sqrt(scatter)), spared, tiles)
+    return Fit(camera, sight, float(2 * answer.cost), shift, float(np.sqrt(scatter)), spared, tiles)
