@@ -32,6 +32,8 @@ SHARED_BY_TILES = 3.0
 much over several tiles alike, which their scatter does not show."""
 LEAST_TILES = 5
 LOOKS = 3
+BETWEEN_CORNERS = 1.5
+"""How much farther off the cube is taken to be between markers than at them, where no camera fits."""
 UNFIT, UNFIT_MM = 3.0, 0.05
 """Corners that lie so much farther than they should from where the best camera sees them, and farther than this, fit
 no camera."""
@@ -61,10 +63,13 @@ class Choice:
 
     @property
     def unfit_mm(self) -> float:
-        """How far the corners lie from where the best camera sees them, where that is more than it may be, else 0."""
+        """How far cube and best camera contradict, where the corners do so by more than they may, else 0."""
         camera = self.alone.camera
-        scatter_mm = camera.rms_px * camera.pixel_mm * self.alone.spared
-        return scatter_mm if self.alone.scatter > UNFIT and scatter_mm > UNFIT_MM else 0.0
+        corners_mm = camera.rms_px * camera.pixel_mm * self.alone.spared
+        if self.alone.scatter < UNFIT or corners_mm < UNFIT_MM:
+            return 0.0
+        # Corners say nothing of what the scan did between them.
+        return max(corners_mm * BETWEEN_CORNERS, self.fit.tile_mm)
 
     @property
     def by_specimen(self) -> bool:

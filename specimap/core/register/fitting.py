@@ -11,6 +11,7 @@ from specimap.core.geometry import Floats, View, rotation_from_vector
 from specimap.core.register.camera import LEAST_SCATTER, CubeCamera, solve_camera
 from specimap.core.register.models import STEPS, Model, at_markers, model_of, moved, priors
 from specimap.core.register.sighting import Sighting
+from specimap.core.robust import SIGMA_OF_MAD
 from specimap.core.scan import ScanView
 
 MOTION_STEPS = np.array([0.1, 0.1, 0.01])
@@ -78,6 +79,15 @@ class Fit:
     scatter: float
     spared: float
     tile_miss: Floats
+
+
+    @property
+    def tile_mm(self) -> float:
+        """How far tiles show from where the camera expects them, sideways, as a robust root mean square; 0 of none."""
+        if self.sight.tissue is None:
+            return 0.0
+        miss_mm = self.tile_miss * self.sight.tissue.sigma_px * self.camera.span_mm
+        return float(np.sqrt(2) * SIGMA_OF_MAD * np.median(np.abs(miss_mm)))
 
 
 POSE = 6
