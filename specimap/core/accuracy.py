@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specimap.core.errors import SpecimapError
-from specimap.core.geometry import Floats, Intrinsics, View, fit_similarity
+from specimap.core.geometry import Floats, View, fit_similarity
 from specimap.core.raycast import RayCaster
-from specimap.core.register.camera import solve_camera
+from specimap.core.register.fitting import refit
 from specimap.core.register.register import fit_homography
 from specimap.core.render import Grid
 from specimap.core.report import LeaveOneOut, MethodFigures, Quartiles, Spread
@@ -54,23 +54,22 @@ class CornersInCube:
 def on_plane(view: View, pixels: Floats, heights: Floats) -> Floats:
     """Where the rays of pixels (N, 2) meet the horizontal planes at ``heights`` (N,) mm: x, y (N, 2)."""
     directions = view.world_rays(pixels)
-    centre = view.cam_from_world.centre
-    reach = (heights - centre[2]) / directions[:, 2]
-    return np.asarray(centre[:2] + reach[:, None] * directions[:, :2])
+    origins = view.origins(pixels)
+    reach = (heights - origins[..., 2]) / directions[:, 2]
+    return np.asarray(origins[..., :2] + reach[:, None] * directions[:, :2])
 
 
 def camera_figures(seen: CornersInCube, view: View, caster: RayCaster) -> MethodFigures:
     """Figures of the camera method."""
     corners, pixels, _ = seen.flat()
     flat = np.linalg.norm(on_plane(view, pixels, corners[:, 2]) - corners[:, :2], axis=1)
-    hits = caster.cast(view.cam_from_world.centre, view.world_rays(pixels))
+    hits = caster.cast(view.origins(pixels), view.world_rays(pixels))
     deep = np.linalg.norm(hits.xyz - corners, axis=1)
 
     def fit(keep: NDArray[np.bool_]) -> Callable[[Floats, Floats], Floats]:
-        lens: Intrinsics = view.intrinsics
-        # The focal length stays: without it, as few as two markers would have to give it.
-        camera = solve_camera(*seen.flat(keep), lens.height, lens.width, focal_px=lens.focal_px)
-        return lambda px, z: on_plane(camera.view, px, z)
+        # Only where the camera stands: as few as two markers would have to give all else.
+        held = refit(view, *seen.flat(keep))
+        return lambda px, z: on_plane(held, px, z)
 
     return MethodFigures(
         corner_2d_mm=spread(flat), corner_3d_mm=quartiles(deep), leave_one_marker_out_mm=leave_one_out(seen, fit)

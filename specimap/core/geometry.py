@@ -30,9 +30,10 @@ def opencv_from_colmap(points_px: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A pinhole camera with square pixels and two radial terms (OpenCV's k1, k2).
+    """A pinhole camera with two radial terms (OpenCV's k1, k2).
 
-    ``focal_px``, ``cx``, ``cy`` in pixels of an image of ``width`` x ``height``; centres at integers.
+    ``focal_px``, ``cx``, ``cy`` in pixels of an image of ``width`` x ``height``; centres at integers. ``aspect``: height
+    of a pixel over its width; ``focal_px`` counts widths.
     """
 
     width: int
@@ -42,6 +43,7 @@ class Intrinsics:
     cy: float
     k1: float = 0.0
     k2: float = 0.0
+    aspect: float = 1.0
 
     @staticmethod
     def centred(
@@ -51,9 +53,15 @@ class Intrinsics:
         return Intrinsics(width, height, focal_px, (width - 1) / 2, (height - 1) / 2, k1, k2)
 
     @property
+    def focals_px(self) -> Floats:
+        """Focal length in widths and in heights of a pixel, (2,)."""
+        return np.array([self.focal_px, self.focal_px / self.aspect])
+
+    @property
     def matrix(self) -> Floats:
         """K, (3, 3)."""
-        return np.array([[self.focal_px, 0, self.cx], [0, self.focal_px, self.cy], [0, 0, 1.0]])
+        fx, fy = self.focals_px
+        return np.array([[fx, 0, self.cx], [0, fy, self.cy], [0, 0, 1.0]])
 
     @property
     def distortion(self) -> Floats:
@@ -65,11 +73,11 @@ class Intrinsics:
         xy = points_cam[..., :2] / points_cam[..., 2:3]
         r2 = (xy * xy).sum(-1, keepdims=True)
         xy = xy * (1 + r2 * (self.k1 + self.k2 * r2))
-        return np.asarray(xy * self.focal_px + np.array([self.cx, self.cy]))
+        return np.asarray(xy * self.focals_px + np.array([self.cx, self.cy]))
 
     def rays(self, pixels: Floats) -> Floats:
         """Directions (..., 3) with z = 1 in the camera frame of the pixels (..., 2), distortion undone."""
-        distorted = (np.asarray(pixels, float) - [self.cx, self.cy]) / self.focal_px
+        distorted = (np.asarray(pixels, float) - [self.cx, self.cy]) / self.focals_px
         xy = distorted
         if self.k1 or self.k2:
             for _ in range(8):  # fixed point; converges to 1e-9 for phone lenses
@@ -77,15 +85,17 @@ class Intrinsics:
                 xy = distorted / (1 + r2 * (self.k1 + self.k2 * r2))
         return np.concatenate([xy, np.ones_like(xy[..., :1])], -1)
 
-    def scaled(self, factor: float) -> Intrinsics:
-        """The same lens for an image resized by ``factor``."""
+    def scaled(self, factor: float, down: float | None = None) -> Intrinsics:
+        """The same lens for an image resized by ``factor``, its rows by ``down`` if that is another."""
+        down = factor if down is None else down
         return replace(
             self,
             width=round(self.width * factor),
-            height=round(self.height * factor),
+            height=round(self.height * down),
             focal_px=self.focal_px * factor,
             cx=(self.cx + 0.5) * factor - 0.5,
-            cy=(self.cy + 0.5) * factor - 0.5,
+            cy=(self.cy + 0.5) * down - 0.5,
+            aspect=self.aspect * factor / down,
         )
 
 
@@ -136,6 +146,28 @@ class View:
         """Unit directions (..., 3) in the world of the pixels' rays; they start at the camera's centre."""
         d = self.intrinsics.rays(pixels) @ self.cam_from_world.R
         return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True))
+
+    def origins(self, pixels: Floats) -> Floats:
+        """Where the rays of pixels (..., 2) start, mm: (..., 3), or (3,) where all start at one place."""
+        del pixels
+        return self.cam_from_world.centre
+
+    def eyes(self, points: Floats) -> Floats:
+        """Whence points (..., 3) are seen, mm: (..., 3), or (3,) where all are seen from one place."""
+        del points
+        return self.cam_from_world.centre
+
+    def mm_per_px(self, depth_mm: float) -> Floats:
+        """What a pixel spans across and down, (2,) mm, at ``depth_mm``."""
+        return np.asarray(depth_mm / self.intrinsics.focals_px)
+
+    def scaled(self, factor: float, down: float | None = None) -> View:
+        """The same camera for an image resized by ``factor``, its rows by ``down`` if that is another."""
+        return replace(self, intrinsics=self.intrinsics.scaled(factor, down))
+
+    def after(self, motion: Pose) -> View:
+        """The same camera for a world whose points ``motion`` takes into this one."""
+        return replace(self, cam_from_world=self.cam_from_world @ motion)
 
 
 def rotation_from_vector(rvec: Floats) -> Floats:

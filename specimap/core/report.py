@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
@@ -104,6 +104,10 @@ class CubeCameraFigures(Section):
     roll_deg: Figure
     mirrored: bool
     markers_found_in: str
+    model: Literal["frame", "scan_rows", "scan_columns"] = "frame"
+    """A frame camera, or a push-broom that recorded the cube row by row or column by column."""
+    pixel_aspect: float = 1.0
+    """Height of a pixel over its width."""
 
 
 class Parallax(Section):

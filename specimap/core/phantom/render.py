@@ -106,7 +106,7 @@ def _sample(
 def _sample_block(
     scene: Scene, view: View, paint: Paint, pixels: Floats, gloss: float
 ) -> tuple[Floats32, Floats, NDArray[np.int32], NDArray[np.int32]]:
-    eye = view.cam_from_world.centre
+    eye = view.origins(pixels)
     directions = view.world_rays(pixels)
     hits = scene.caster.cast(eye, directions)
     points = eye + directions * hits.distance[:, None]

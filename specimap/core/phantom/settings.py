@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Literal
 
 import numpy as np
 
@@ -78,6 +79,18 @@ class PhantomSettings:
     hsi_tilt_deg: float = 1.5
     cube_rotation_deg: float = 0.0
     """Roll of the hyperspectral camera about its optical axis."""
+    cube_aspect: float = 1.0
+    """Height of a cube's pixel over its width."""
+    cube_scan: Literal["none", "rows", "columns"] = "none"
+    """What a push-broom camera records one of at a time; ``none`` is a frame camera."""
+    scan_skew: float = 0.0
+    """Motion along the line while the scan goes on by 1 mm: a stage that is not square to the line."""
+    scan_pitch_deg: float = 0.0
+    """Forward tilt of a push-broom camera that moves level."""
+    scan_wobble_mm: float = 0.0
+    """Amplitude of what the stage runs ahead and behind, twice over the whole scan."""
+    cube_k1: float = 0.0
+    """First radial distortion of a frame camera."""
     cube_noise: float = 0.005
     """Sd in reflectance at the best band; about four times that at both ends of the range."""
     bad_band_fraction: float = 0.0
@@ -97,10 +110,12 @@ class PhantomSettings:
             "card_tilt_deg": 0, "card_lift_mm": 0, "photos": 1, "photo_size": 16, "focal_factor": 0.3,
             "focal_spread": 0, "distance_mm": 60, "blur_px": 0, "exposure_spread": 0, "noise": 0,
             "cube_rows": 16, "cube_cols": 16, "bands": 1, "hsi_distance_mm": 60, "hsi_tilt_deg": 0,
+            "cube_aspect": 0.1, "scan_skew": -0.5, "scan_pitch_deg": -30, "scan_wobble_mm": 0, "cube_k1": -1,
             "cube_noise": 0, "bad_band_fraction": 0, "dead_pixel_fraction": 0,
         }  # fmt: skip
         most: dict[str, float] = {
             "texture_contrast": 2.5, "card_tilt_deg": 20, "hsi_tilt_deg": 20, "focal_spread": 0.1,
+            "cube_aspect": 10, "scan_skew": 0.5, "scan_pitch_deg": 30, "scan_wobble_mm": 2, "cube_k1": 1,
             "bad_band_fraction": 0.5, "dead_pixel_fraction": 0.5,
         }  # fmt: skip
         for name, low in least.items():
@@ -124,6 +139,10 @@ class PhantomSettings:
         if not np.isfinite([*self.moved_mm, self.moved_deg]).all() or not abs(self.moved_tilt_deg) <= _MOST_TILT_DEG:
             raise SettingsError(
                 "The specimen's motion is not finite, or tilts it too far.", advice=_ADVICE, setting="moved_mm"
+            )
+        if self.cube_scan not in ("none", "rows", "columns"):
+            raise SettingsError(
+                f"cube_scan is {self.cube_scan}.", advice="Use none, rows or columns.", setting="cube_scan"
             )
         if min(self.specimen_mm) < 1:
             raise SettingsError("specimen_mm is below 1 mm.", advice=_ADVICE, setting="specimen_mm")

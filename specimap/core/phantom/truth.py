@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from zipfile import BadZipFile
@@ -13,6 +14,8 @@ from PIL import Image
 from specimap.core.errors import NotFoundError
 from specimap.core.files import atomic_path
 from specimap.core.geometry import Array, Floats, Intrinsics, Pose, View
+from specimap.core.phantom.views import WobblyScan
+from specimap.core.scan import Axis, ScanView
 
 
 def _no_vertices() -> Floats:
@@ -36,6 +39,7 @@ class Truth:
     photo_names: list[str]
     """Relative to the phantom's folder."""
     hsi_view: View
+    """A :class:`~specimap.core.scan.ScanView` where the cube's camera is a push-broom."""
     hsi_xyz: NDArray[np.float32]
     """(H, W, 3) mm: first hit of the ray through each cube pixel's centre; NaN if none.
 
@@ -78,6 +82,7 @@ def save_truth(truth: Truth, path: Path) -> None:
         "hsi_t": truth.hsi_view.cam_from_world.t,
         "hsi_dist": np.append(truth.hsi_view.intrinsics.distortion, 0.0),
         "hsi_size": np.array([w, h]),
+        **_scan_arrays(truth.hsi_view),
         "hsi_xyz": truth.hsi_xyz,
         "hsi_class": truth.hsi_class,
         "hsi_abundance": truth.abundance.astype(np.float16),
@@ -123,7 +128,7 @@ def _read(file: Path) -> Truth:
             edge_mm=float(z["marker_length"]),
             views=views,
             photo_names=names,
-            hsi_view=_view(z["hsi_K"], z["hsi_R"], z["hsi_t"], z["hsi_dist"], z["hsi_size"]),
+            hsi_view=_scanned(_view(z["hsi_K"], z["hsi_R"], z["hsi_t"], z["hsi_dist"], z["hsi_size"]), z),
             hsi_xyz=z["hsi_xyz"],
             hsi_class=z["hsi_class"],
             abundance=z["hsi_abundance"].astype(np.float32),
@@ -140,9 +145,31 @@ def _read(file: Path) -> Truth:
 def _view(K: Floats, R: Floats, t: Floats, dist: Floats, size: NDArray[np.int64] | tuple[int, int]) -> View:
     width, height = (int(s) for s in size)
     lens = Intrinsics(
-        width, height, float(K[0, 0]), float(K[0, 2]), float(K[1, 2]), float(dist[0]), float(dist[1])
-    )
+        width, height, float(K[0, 0]), float(K[0, 2]), float(K[1, 2]), float(dist[0]), float(dist[1]),
+        aspect=float(K[0, 0] / K[1, 1]),
+    )  # fmt: skip
     return View(lens, Pose(R, t))
+
+
+def _scan_arrays(view: View) -> dict[str, Array]:
+    """What a push-broom camera has beyond a lens and a pose; nothing for a frame camera."""
+    if not isinstance(view, ScanView):
+        return {}
+    wobble = view.wobble_mm if isinstance(view, WobblyScan) else 0.0
+    return {
+        "hsi_scan": np.array(view.scan),
+        "hsi_scan_motion": np.array([view.skew, view.climb, view.depth_mm, wobble]),
+    }
+
+
+def _scanned(view: View, stored: Mapping[str, Array]) -> View:
+    """The inverse of :func:`_scan_arrays`."""
+    if "hsi_scan" not in stored:
+        return view
+    axis: Axis = "rows" if str(stored["hsi_scan"]) == "rows" else "columns"
+    skew, climb, depth, wobble = (float(v) for v in stored["hsi_scan_motion"])
+    scan = view.intrinsics, view.cam_from_world, axis, skew, climb, depth
+    return WobblyScan(*scan, wobble) if wobble else ScanView(*scan)
 
 
 def _photo_size(photo: Path) -> tuple[int, int]:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+from functools import partial
+
 import numpy as np
 
 from specimap.core.geometry import Floats, Intrinsics, Pose, View, look_at, rotation_from_vector
 from specimap.core.phantom.settings import PhantomSettings, Stream
+from specimap.core.scan import ScanView
 
 _TOP_SHARE = 1 / 6
 _TWO_RINGS_FROM = 14  # below this, one ring keeps neighbours close enough for stereo
@@ -56,15 +60,54 @@ def _photo_view(
 def hsi_view(settings: PhantomSettings) -> View:
     """The cube's camera above the tray, slightly tilted, framing specimen and cards."""
     rng = np.random.default_rng([settings.seed, Stream.CUBE, 1])
-    shorter = min(settings.cube_rows, settings.cube_cols)
+    # The shorter side in widths of a pixel frames the scene.
+    shorter = min(settings.cube_rows * settings.cube_aspect, settings.cube_cols)
     focal = shorter * settings.hsi_distance_mm / (2.12 * settings.scene_mm)
-    lens = Intrinsics.centred(settings.cube_cols, settings.cube_rows, focal)
+    lens = Intrinsics.centred(settings.cube_cols, settings.cube_rows, focal, settings.cube_k1)
+    lens = replace(lens, aspect=settings.cube_aspect)
     around = rng.uniform(0, 2 * np.pi)
     tilt = np.radians(settings.hsi_tilt_deg) * np.array([np.cos(around), np.sin(around), 0])
     down = np.diag([1.0, -1.0, -1.0]) @ rotation_from_vector(tilt)
-    eye = -settings.hsi_distance_mm * down[2]
+    if settings.cube_scan == "none":
+        eye = -settings.hsi_distance_mm * down[2]
+        R = _roll(np.radians(settings.cube_rotation_deg)) @ down
+        return View(lens, Pose(R, -R @ eye))
+    rows = settings.cube_scan == "rows"
     R = _roll(np.radians(settings.cube_rotation_deg)) @ down
-    return View(lens, Pose(R, -R @ eye))
+    pitch = np.radians(settings.scan_pitch_deg)
+    R = rotation_from_vector(pitch * np.array([1.0, 0, 0] if rows else [0, -1.0, 0])) @ R
+    eye = -settings.hsi_distance_mm * R[2]
+    pose = Pose(R, -R @ eye)
+    line, across = (0, 1) if rows else (1, 0)
+    # A level stage: what the camera's own axes climb, its motion along z takes back.
+    climb = -(R[across, 2] + settings.scan_skew * R[line, 2]) / R[2, 2]
+    where = ScanView if not settings.scan_wobble_mm else partial(WobblyScan, wobble_mm=settings.scan_wobble_mm)
+    return where(lens, pose, settings.cube_scan, settings.scan_skew, float(climb), settings.hsi_distance_mm)
+
+
+@dataclass(frozen=True)
+class WobblyScan(ScanView):
+    """A push-broom camera whose stage runs ahead and behind by ``wobble_mm``, twice over the whole scan."""
+
+    wobble_mm: float = 0.0
+
+    def project(self, points: Floats) -> Floats:
+        """World points (..., 3) mm to pixels (..., 2)."""
+        even = super().project(points)
+        pixels = even.copy()
+        for _ in range(20):
+            pixels[..., self.along] = even[..., self.along] - self._ahead_px(pixels)
+        return pixels
+
+    def origins(self, pixels: Floats) -> Floats:
+        """Where the rays of pixels (..., 2) start, mm: (..., 3)."""
+        even = np.array(pixels, float)
+        even[..., self.along] += self._ahead_px(even)
+        return super().origins(even)
+
+    def _ahead_px(self, pixels: Floats) -> Floats:
+        length = (self.intrinsics.width, self.intrinsics.height)[self.along]
+        return np.asarray(self.wobble_mm * self.step_px * np.sin(4 * np.pi * pixels[..., self.along] / length))
 
 
 def _roll(angle: float) -> Floats:

@@ -131,7 +131,7 @@ def _register(
     other = (
         homography_xyz(homography, coarse, fine, pixels)
         if by_camera
-        else caster.cast(camera.view.cam_from_world.centre, camera.view.world_rays(pixels)).xyz
+        else caster.cast(camera.view.origins(pixels), camera.view.world_rays(pixels)).xyz
     )
     apart = np.linalg.norm(chosen.xyz - other, axis=1).astype(np.float32)
     progress(0.3)
@@ -265,11 +265,13 @@ def _camera(camera: CubeCamera, found: CubeMarkers, cube: Cube) -> CubeCameraFig
     pose: Pose = camera.view.cam_from_world
     x_axis = pose.R[:, 0]
     return CubeCameraFigures(
-        focal_px=camera.view.intrinsics.focal_px,
+        focal_px=camera.focal_px,
         focal_relative_sd=camera.focal_sd,
         distance_mm=float(pose.centre[2]),
         reprojection_rms_px=camera.rms_px,
         roll_deg=float(np.degrees(np.arctan2(-x_axis[1], x_axis[0]))),
         mirrored=found.mirrored,
         markers_found_in=found.where,
+        model=camera.model.scanned,
+        pixel_aspect=camera.view.intrinsics.aspect,
     )

@@ -16,12 +16,10 @@ from scipy.optimize import least_squares
 
 from specimap.core.errors import RegistrationError
 from specimap.core.geometry import Floats, Intrinsics, Pose, View, rotation_from_vector
+from specimap.core.register.models import FOCAL_PRIOR_SD, FOCAL_RANGE, FRAME, Model, moved
+from specimap.core.scan import ScanView
 
-FOCAL_RANGE = (0.7, 30.0)
-"""Focal lengths tried, in widths of the cube."""
 FOCAL_STARTS = 24
-FOCAL_PRIOR_SD = float(np.log(FOCAL_RANGE[1] / FOCAL_RANGE[0])) / 4
-"""Standard deviation of the logarithm of the focal length about the middle of the range: only keeps it finite."""
 LEAST_SCATTER = 0.5
 """Corners fit together better than they lie, by chance and since their errors share parts: their variance is not taken
 for less than this share of what was said."""
@@ -39,29 +37,42 @@ class Anchor:
 @dataclass(frozen=True)
 class CubeCamera:
     """The solved camera: ``view``; RMS corner distance ``rms_px``; ``focal_sd``: one standard deviation of the
-    logarithm of the focal length, as the corners determine it; ``covariance`` (7, 7) of rotation, translation
-    and log focal length."""
+    logarithm of the focal length, as the corners determine it; ``covariance`` (n, n) of the ``model``'s numbers, rotation,
+    translation and log focal length first (:func:`specimap.core.register.models.moved`)."""
 
     view: View
     rms_px: float
     focal_sd: float
     covariance: Floats
+    model: Model = FRAME
 
     def sideways_mm(self, points: Floats) -> float:
         """Sideways standard deviation of what is registered at ``points`` (N, 3) mm, root mean square: how far they
         would move in the cube within what the corners leave open of the camera."""
         step = 1e-4
         J = np.stack(
-            [(_moved(self.view, step * e).project(points) - _moved(self.view, -step * e).project(points)) / (2 * step)
-             for e in np.eye(7)], -1,
+            [(moved(self.view, step * e).project(points) - moved(self.view, -step * e).project(points)) / (2 * step)
+             for e in np.eye(len(self.covariance))], -1,
         )  # fmt: skip
+        J = J * self.span_mm[:, None]
         variance = np.einsum("nij,jk,nik->n", J, self.covariance, J)
-        return float(np.sqrt(np.maximum(variance, 0).mean())) * self.pixel_mm
+        return float(np.sqrt(np.maximum(variance, 0).mean()))
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length in pixels along a line of the cube: of a push-broom camera, where it sees in perspective."""
+        view = self.view
+        return float(view.intrinsics.focals_px[1 - view.along if isinstance(view, ScanView) else 0])
+
+    @property
+    def span_mm(self) -> Floats:
+        """What a pixel spans at the marker plane, across and down, (2,)."""
+        return self.view.mm_per_px(float(self.view.cam_from_world.centre[2]))
 
     @property
     def pixel_mm(self) -> float:
         """What a pixel spans at the marker plane."""
-        return float(self.view.cam_from_world.centre[2]) / self.view.intrinsics.focal_px
+        return float(np.sqrt(self.span_mm.prod()))
 
 
 def solve_camera(
@@ -81,9 +92,10 @@ def solve_camera(
     best: tuple[float, Pose, float] | None = None
     for focal in starts:
         lens = Intrinsics.centred(cols, rows, focal)
-        ok, rvec, tvec = cv2.solvePnP(
-            corners, corners_px[:, None], lens.matrix, None, flags=cv2.SOLVEPNP_SQPNP
-        )
+        try:
+            ok, rvec, tvec = cv2.solvePnP(corners, corners_px[:, None], lens.matrix, None, flags=cv2.SOLVEPNP_SQPNP)
+        except cv2.error:  # it asserts where no camera of this kind comes near
+            continue
         if not ok or not np.isfinite(tvec).all():
             continue
         pose = Pose(rotation_from_vector(rvec.ravel()), tvec.ravel())
@@ -116,7 +128,7 @@ def _refine(
     off = float(np.log(lens.focal_px / usual))
 
     def unpack(x: Floats) -> View:
-        return _moved(start, x if free_focal else np.append(x[:6], 0.0))
+        return moved(start, x if free_focal else np.append(x[:6], 0.0))
 
     def residual(x: Floats) -> Floats:
         view = unpack(x)
@@ -134,12 +146,3 @@ def _refine(
     scatter = float(((miss * weight) ** 2).sum()) / max(2 * len(corners) - 7, 1)
     covariance = np.linalg.pinv(answer.jac.T @ answer.jac) * max(LEAST_SCATTER, scatter)
     return CubeCamera(view, rms, float(np.sqrt(covariance[6, 6])), covariance)
-
-
-def _moved(view: View, x: Floats) -> View:
-    """``view`` turned by ``x[:3]``, shifted by ``x[3:6]``, its focal length ``exp(x[6])`` as long and its distance with
-    it."""
-    lens, pose = view.intrinsics, view.cam_from_world
-    zoom = float(np.exp(x[6]))
-    turned = Pose(rotation_from_vector(x[:3]) @ pose.R, pose.t * zoom + x[3:6])
-    return View(Intrinsics.centred(lens.width, lens.height, lens.focal_px * zoom), turned)

@@ -120,7 +120,7 @@ def place_by_camera(view: View, caster: RayCaster, mirrored: bool) -> Placement:
     """
 
     def place(rows: NDArray[np.int64], cols: NDArray[np.int64], seen: Floats) -> Placement:
-        hits = caster.cast(view.cam_from_world.centre, view.world_rays(seen))
+        hits = caster.cast(view.origins(seen), view.world_rays(seen))
         keep = hits.hit
         normals, rgb = caster.normals(hits)[keep], caster.colours(hits)[keep]
         return _placed(
@@ -164,7 +164,7 @@ def _placed(
     caster: RayCaster,
     where: tuple[NDArray[np.int32], NDArray[np.float32]] | None,
 ) -> Placement:
-    away = view.cam_from_world.centre - xyz
+    away = view.eyes(xyz) - xyz
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     cosine = np.clip((away * normal).sum(1), -1, 1)
     occluded, undercut = np.zeros(len(xyz), bool), np.zeros(len(xyz), bool)
@@ -190,6 +190,6 @@ def _hidden_from(view: View, xyz: NDArray[np.float32], caster: RayCaster) -> NDA
     above[:, 2] = float(caster.mesh.vertices[:, 2].max()) + 1.0
     top = caster.cast(above, np.broadcast_to([0.0, 0.0, -1.0], above.shape))
     place = np.where(top.hit[:, None], top.xyz, xyz).astype(float)
-    away = view.cam_from_world.centre - place
+    away = view.eyes(place) - place
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     return caster.cast(place + CLEARANCE_MM * away, away).hit
