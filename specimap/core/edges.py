@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from specimap.core.geometry import Floats
 from specimap.core.robust import SIGMA_OF_MAD
+from specimap.core.sampling import sample
 
 Flags = NDArray[np.bool_]
 Singles = NDArray[np.float32]
@@ -73,14 +74,11 @@ def _fit_edges(
     deviations (E,), and the edges' own widths (E,), infinite where no profile is clear; all in pixels. ``centres``
     (E, 2): of the squares they belong to; ``widths`` (E,): how wide the edges have proved so far."""
     length = np.linalg.norm(b - a, axis=1)
-    along = (b - a) / length[:, None]
-    normal = np.stack([along[:, 1], -along[:, 0]], -1)
-    depth = _dot(normal, centres - a)
-    normal *= np.where(depth > 0, -1.0, 1.0)[:, None]  # outward: from black into the white quiet zone
+    along, normal, depth = outward_normals(a, b, centres)
     lines = _lines(normal, a)
     errors = np.full(len(a), UNMEASURED_PX)
     # The dark border is one module wide (a sixth of the edge, or less in larger dictionaries), seen at a slant.
-    reach = np.clip(share * 2 * np.abs(depth), 1.6, 8.0)
+    reach = np.clip(share * 2 * depth, 1.6, 8.0)
     s = np.linspace(EDGE_MARGIN, 1 - EDGE_MARGIN, PROFILES_PER_EDGE) * length[:, None]
     v, clear, width = np.empty(s.shape), np.empty(s.shape, bool), np.empty(s.shape)
     lacking = np.minimum(np.sqrt(np.maximum(EDGE_PX**2 - widths**2, 0)), MOST_BLUR * length)
@@ -89,7 +87,7 @@ def _fit_edges(
         light = cv2.GaussianBlur(linear, (0, 0), float(sd)) if sd else linear
         alike = np.flatnonzero(blur == sd)
         for some in np.array_split(alike[np.argsort(reach[alike])], -(-len(alike) // BATCH)):
-            v[some], clear[some], width[some] = _positions(light, *(x[some] for x in (a, along, normal, s, reach)))
+            v[some], clear[some], width[some] = edge_positions(light, *(x[some] for x in (a, along, normal, s, reach)))
     wide = _median(width, clear)
     fits = np.flatnonzero(clear.sum(1) >= PROFILES_PER_EDGE // 2)
     if not len(fits):
@@ -106,7 +104,17 @@ def _fit_edges(
     return lines, errors, wide
 
 
-def _positions(
+def outward_normals(a: Floats, b: Floats, dark: Floats) -> tuple[Floats, Floats, Floats]:
+    """Directions (E, 2) along edges from ``a`` to ``b`` (both (E, 2)) and across them, from what is ``dark`` (E, 2) into
+    what is bright, and how far (E,) the edges are from the former."""
+    along = (b - a) / np.linalg.norm(b - a, axis=1)[:, None]
+    normal = np.stack([along[:, 1], -along[:, 0]], -1)
+    depth = _dot(normal, dark - a)
+    normal *= np.where(depth > 0, -1.0, 1.0)[:, None]
+    return along, normal, np.abs(depth)
+
+
+def edge_positions(
     linear: Singles, a: Floats, along: Floats, normal: Floats, s: Floats, reach: Floats
 ) -> tuple[Floats, Flags, Floats]:
     """Where the edge crosses the profiles at ``s`` (E, K) along it, in pixels outward (E, K); which are clear; how wide
@@ -124,7 +132,7 @@ def _positions(
         inside &= ((tip >= 1) & (tip <= [width - 2, height - 2])).all(-1)
     x, y = ((feet[..., i, None] + (d * normal[:, i, None])[:, None]).astype(np.float32) for i in (0, 1))
     rows = len(a), -1
-    sampled = cv2.remap(linear, x.reshape(rows), y.reshape(rows), cv2.INTER_CUBIC).reshape(x.shape)
+    sampled = sample(linear, x.reshape(rows), y.reshape(rows), cv2.INTER_CUBIC).reshape(x.shape)
     profile = np.where(valid, sampled, sampled[..., :1]).astype(float)
     slope = np.gradient(profile, SAMPLE_PX, axis=2)
     last = np.broadcast_to((count - 1)[:, None, None], (*s.shape, 1))
@@ -133,7 +141,7 @@ def _positions(
     weight = np.where(valid, np.clip(slope, 0, None), 0.0)
     contrast = profile.max(2) - profile.min(2)
     clear = inside & (contrast > 0.25 * _median(contrast, inside)[:, None]) & (weight.sum(2) > 0)
-    clear[inside.sum(1) < PROFILES_PER_EDGE // 2] = False
+    clear[inside.sum(1) < s.shape[1] // 2] = False
     # Centroid of the slope in a window that is then centred on it: symmetric blur does not move it.
     position = np.take_along_axis(d, weight.argmax(2), 1)
     half = np.maximum(1.2, 0.7 * reach)[:, None, None]
