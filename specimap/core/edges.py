@@ -33,6 +33,9 @@ SOFTER_PX = 0.2
 """Blurs are multiples of this, so that the edges of a photo share a few blurred pictures."""
 MOST_BLUR = 1 / 40
 """Largest blur over the length of the edge: more would bring the marker's pattern into what is measured at its rim."""
+BLUR_SAMPLES = 41
+SIGMAS_BETWEEN_QUARTERS = 1.349
+"""From a quarter to three quarters of a normal distribution."""
 UNMEASURED_PX = 0.5
 """Standard deviation of an edge, and of a corner, that gave no line."""
 
@@ -151,6 +154,30 @@ def edge_positions(
         position = np.where(total > 0, moment / np.maximum(total, 1e-12), position)
     variance = (windowed * (d[:, None] - position[..., None]) ** 2).sum(2) / np.maximum(total, 1e-12)
     return position, clear, np.sqrt(variance)
+
+
+def edge_blurs(linear: Singles, squares: Floats) -> Floats:
+    """How blurred (4 N,) the edges of N squares are in linear light (H, W), one standard deviation in pixels; NaN where
+    an edge is not clear. ``squares`` (N, 4, 2): their corners."""
+    a, b = squares.reshape(-1, 2), np.roll(squares, -1, axis=1).reshape(-1, 2)
+    along, normal, depth = outward_normals(a, b, np.repeat(squares.mean(1), 4, axis=0))
+    s = np.linspace(EDGE_MARGIN, 1 - EDGE_MARGIN, PROFILES_PER_EDGE) * np.linalg.norm(b - a, axis=1)[:, None]
+    d = np.clip(2 * REACH_SHARES[0] * depth, 1.6, 5.0)[:, None] * np.linspace(-1, 1, BLUR_SAMPLES)
+    places = (a[:, None] + s[..., None] * along[:, None])[:, :, None] + (d[..., None] * normal[:, None])[:, None]
+    rows = len(a), -1
+    x, y = (places[..., i].astype(np.float32).reshape(rows) for i in (0, 1))
+    rise = np.median(sample(linear, x, y, cv2.INTER_CUBIC).reshape(places.shape[:-1]), axis=1).astype(float)
+    few = BLUR_SAMPLES // 8
+    low, high = rise[:, :few].mean(1, keepdims=True), rise[:, -few:].mean(1, keepdims=True)
+    clear = (high > low).ravel()
+    share = np.maximum.accumulate((rise - low) / np.where(high > low, high - low, 1), axis=1)
+    quarters = np.stack([(share < quarter).sum(1) for quarter in (0.25, 0.75)], 1).clip(1, BLUR_SAMPLES - 1)
+    before, after = (np.take_along_axis(share, quarters - k, 1) for k in (1, 0))
+    part = (np.array([0.25, 0.75]) - before) / np.maximum(after - before, 1e-9)
+    places_of = quarters - 1 + np.clip(part, 0, 1)
+    step = 2 * d[:, -1] / (BLUR_SAMPLES - 1)
+    blurs = (places_of[:, 1] - places_of[:, 0]) * step / SIGMAS_BETWEEN_QUARTERS
+    return np.asarray(np.where(clear, blurs, np.nan))
 
 
 def _fit_robustly(u: Floats, v: Floats, clear: Flags) -> tuple[Floats, Floats, Floats, NDArray[np.int64]]:
