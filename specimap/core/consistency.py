@@ -12,6 +12,7 @@ from scipy.sparse import csr_array
 
 from specimap.core.geometry import Floats, Intrinsics, Pose
 from specimap.core.raycast import RayCaster
+from specimap.core.sampling import sample
 from specimap.core.surface import Mesh
 
 Singles = NDArray[np.float32]
@@ -103,8 +104,8 @@ def _highlights(points: Floats, views: Indices, photographs: Photographs) -> NDA
     places = {v: np.nonzero(views == v) for v in np.unique(views[views >= 0]).tolist()}
     for v, (row, column) in places.items():
         soft = cv2.GaussianBlur(photographs.greys[v], (0, 0), BRIGHTNESS_SIGMA_PX)
-        at = photographs.lens.project(photographs.poses[v].apply(points[row])).astype(np.float32)
-        bright[row, column] = cv2.remap(soft, at[:, :1], at[:, 1:], cv2.INTER_LINEAR).ravel()
+        at = photographs.lens.project(photographs.poses[v].apply(points[row]))
+        bright[row, column] = sample(soft, at[:, 0], at[:, 1])
     usual = _median_of_known(bright)
     for v, (row, column) in places.items():
         # Photos are exposed differently; what most of their surface shows is no highlight.
@@ -181,7 +182,7 @@ def patch_scores(
         for v in range(len(poses)):
             of = slice(first[v], first[v + 1])
             if of.stop > of.start:
-                values[of] = cv2.remap(photographs.greys[v], x[of], y[of], cv2.INTER_LINEAR)
+                values[of] = sample(photographs.greys[v], x[of], y[of])
         centred = (values - (values @ weight)[:, None]) * root
         square = np.einsum("es,es->e", centred, centred)
         centred /= np.sqrt(square + NOISE_VARIANCE / 4)[:, None]

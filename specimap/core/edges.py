@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from specimap.core.geometry import Floats
 from specimap.core.robust import SIGMA_OF_MAD
+from specimap.core.sampling import sample
 
 Flags = NDArray[np.bool_]
 Singles = NDArray[np.float32]
@@ -32,6 +33,9 @@ SOFTER_PX = 0.2
 """Blurs are multiples of this, so that the edges of a photo share a few blurred pictures."""
 MOST_BLUR = 1 / 40
 """Largest blur over the length of the edge: more would bring the marker's pattern into what is measured at its rim."""
+BLUR_SAMPLES = 41
+SIGMAS_BETWEEN_QUARTERS = 1.349
+"""From a quarter to three quarters of a normal distribution."""
 UNMEASURED_PX = 0.5
 """Standard deviation of an edge, and of a corner, that gave no line."""
 
@@ -73,14 +77,11 @@ def _fit_edges(
     deviations (E,), and the edges' own widths (E,), infinite where no profile is clear; all in pixels. ``centres``
     (E, 2): of the squares they belong to; ``widths`` (E,): how wide the edges have proved so far."""
     length = np.linalg.norm(b - a, axis=1)
-    along = (b - a) / length[:, None]
-    normal = np.stack([along[:, 1], -along[:, 0]], -1)
-    depth = _dot(normal, centres - a)
-    normal *= np.where(depth > 0, -1.0, 1.0)[:, None]  # outward: from black into the white quiet zone
+    along, normal, depth = outward_normals(a, b, centres)
     lines = _lines(normal, a)
     errors = np.full(len(a), UNMEASURED_PX)
     # The dark border is one module wide (a sixth of the edge, or less in larger dictionaries), seen at a slant.
-    reach = np.clip(share * 2 * np.abs(depth), 1.6, 8.0)
+    reach = np.clip(share * 2 * depth, 1.6, 8.0)
     s = np.linspace(EDGE_MARGIN, 1 - EDGE_MARGIN, PROFILES_PER_EDGE) * length[:, None]
     v, clear, width = np.empty(s.shape), np.empty(s.shape, bool), np.empty(s.shape)
     lacking = np.minimum(np.sqrt(np.maximum(EDGE_PX**2 - widths**2, 0)), MOST_BLUR * length)
@@ -89,7 +90,7 @@ def _fit_edges(
         light = cv2.GaussianBlur(linear, (0, 0), float(sd)) if sd else linear
         alike = np.flatnonzero(blur == sd)
         for some in np.array_split(alike[np.argsort(reach[alike])], -(-len(alike) // BATCH)):
-            v[some], clear[some], width[some] = _positions(light, *(x[some] for x in (a, along, normal, s, reach)))
+            v[some], clear[some], width[some] = edge_positions(light, *(x[some] for x in (a, along, normal, s, reach)))
     wide = _median(width, clear)
     fits = np.flatnonzero(clear.sum(1) >= PROFILES_PER_EDGE // 2)
     if not len(fits):
@@ -106,7 +107,17 @@ def _fit_edges(
     return lines, errors, wide
 
 
-def _positions(
+def outward_normals(a: Floats, b: Floats, dark: Floats) -> tuple[Floats, Floats, Floats]:
+    """Directions (E, 2) along edges from ``a`` to ``b`` (both (E, 2)) and across them, from what is ``dark`` (E, 2) into
+    what is bright, and how far (E,) the edges are from the former."""
+    along = (b - a) / np.linalg.norm(b - a, axis=1)[:, None]
+    normal = np.stack([along[:, 1], -along[:, 0]], -1)
+    depth = _dot(normal, dark - a)
+    normal *= np.where(depth > 0, -1.0, 1.0)[:, None]
+    return along, normal, np.abs(depth)
+
+
+def edge_positions(
     linear: Singles, a: Floats, along: Floats, normal: Floats, s: Floats, reach: Floats
 ) -> tuple[Floats, Flags, Floats]:
     """Where the edge crosses the profiles at ``s`` (E, K) along it, in pixels outward (E, K); which are clear; how wide
@@ -124,7 +135,7 @@ def _positions(
         inside &= ((tip >= 1) & (tip <= [width - 2, height - 2])).all(-1)
     x, y = ((feet[..., i, None] + (d * normal[:, i, None])[:, None]).astype(np.float32) for i in (0, 1))
     rows = len(a), -1
-    sampled = cv2.remap(linear, x.reshape(rows), y.reshape(rows), cv2.INTER_CUBIC).reshape(x.shape)
+    sampled = sample(linear, x.reshape(rows), y.reshape(rows), cv2.INTER_CUBIC).reshape(x.shape)
     profile = np.where(valid, sampled, sampled[..., :1]).astype(float)
     slope = np.gradient(profile, SAMPLE_PX, axis=2)
     last = np.broadcast_to((count - 1)[:, None, None], (*s.shape, 1))
@@ -133,7 +144,7 @@ def _positions(
     weight = np.where(valid, np.clip(slope, 0, None), 0.0)
     contrast = profile.max(2) - profile.min(2)
     clear = inside & (contrast > 0.25 * _median(contrast, inside)[:, None]) & (weight.sum(2) > 0)
-    clear[inside.sum(1) < PROFILES_PER_EDGE // 2] = False
+    clear[inside.sum(1) < s.shape[1] // 2] = False
     # Centroid of the slope in a window that is then centred on it: symmetric blur does not move it.
     position = np.take_along_axis(d, weight.argmax(2), 1)
     half = np.maximum(1.2, 0.7 * reach)[:, None, None]
@@ -143,6 +154,30 @@ def _positions(
         position = np.where(total > 0, moment / np.maximum(total, 1e-12), position)
     variance = (windowed * (d[:, None] - position[..., None]) ** 2).sum(2) / np.maximum(total, 1e-12)
     return position, clear, np.sqrt(variance)
+
+
+def edge_blurs(linear: Singles, squares: Floats) -> Floats:
+    """How blurred (4 N,) the edges of N squares are in linear light (H, W), one standard deviation in pixels; NaN where
+    an edge is not clear. ``squares`` (N, 4, 2): their corners."""
+    a, b = squares.reshape(-1, 2), np.roll(squares, -1, axis=1).reshape(-1, 2)
+    along, normal, depth = outward_normals(a, b, np.repeat(squares.mean(1), 4, axis=0))
+    s = np.linspace(EDGE_MARGIN, 1 - EDGE_MARGIN, PROFILES_PER_EDGE) * np.linalg.norm(b - a, axis=1)[:, None]
+    d = np.clip(2 * REACH_SHARES[0] * depth, 1.6, 5.0)[:, None] * np.linspace(-1, 1, BLUR_SAMPLES)
+    places = (a[:, None] + s[..., None] * along[:, None])[:, :, None] + (d[..., None] * normal[:, None])[:, None]
+    rows = len(a), -1
+    x, y = (places[..., i].astype(np.float32).reshape(rows) for i in (0, 1))
+    rise = np.median(sample(linear, x, y, cv2.INTER_CUBIC).reshape(places.shape[:-1]), axis=1).astype(float)
+    few = BLUR_SAMPLES // 8
+    low, high = rise[:, :few].mean(1, keepdims=True), rise[:, -few:].mean(1, keepdims=True)
+    clear = (high > low).ravel()
+    share = np.maximum.accumulate((rise - low) / np.where(high > low, high - low, 1), axis=1)
+    quarters = np.stack([(share < quarter).sum(1) for quarter in (0.25, 0.75)], 1).clip(1, BLUR_SAMPLES - 1)
+    before, after = (np.take_along_axis(share, quarters - k, 1) for k in (1, 0))
+    part = (np.array([0.25, 0.75]) - before) / np.maximum(after - before, 1e-9)
+    places_of = quarters - 1 + np.clip(part, 0, 1)
+    step = 2 * d[:, -1] / (BLUR_SAMPLES - 1)
+    blurs = (places_of[:, 1] - places_of[:, 0]) * step / SIGMAS_BETWEEN_QUARTERS
+    return np.asarray(np.where(clear, blurs, np.nan))
 
 
 def _fit_robustly(u: Floats, v: Floats, clear: Flags) -> tuple[Floats, Floats, Floats, NDArray[np.int64]]:

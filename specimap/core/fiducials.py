@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -19,10 +20,13 @@ from specimap.core.colour import linear_from_srgb
 from specimap.core.edges import refine_corners
 from specimap.core.errors import UnknownDictionaryError
 from specimap.core.geometry import Array, Floats
+from specimap.core.tone import TRIALS, shift_of_cells, tone_between
 
 Bytes = NDArray[np.uint8]
 
 SMALLEST_EDGE_PX = 7.0
+TONE_PHOTOS = 8
+"""Photos whose markers tell the tone of all."""
 DICTIONARY_TRIALS = (
     "DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL",
     "DICT_ARUCO_MIP_36h12", "DICT_APRILTAG_16h5", "DICT_APRILTAG_25h9", "DICT_APRILTAG_36h10",
@@ -54,6 +58,11 @@ def dictionary_named(name: str) -> cv2.aruco.Dictionary:
     Raises:
         UnknownDictionaryError: there is none of that name.
     """
+    return cv2.aruco.getPredefinedDictionary(dictionary_number(name))
+
+
+def dictionary_number(name: str) -> int:
+    """OpenCV's number of the dictionary of that name; raises as :func:`dictionary_named` does."""
     number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
     if not isinstance(number, int):
         known = sorted(n for n in dir(cv2.aruco) if n.startswith("DICT_"))
@@ -62,7 +71,7 @@ def dictionary_named(name: str) -> cv2.aruco.Dictionary:
             advice=f"Use one of: {', '.join(known)}.",
             known=known,
         )
-    return cv2.aruco.getPredefinedDictionary(number)
+    return number
 
 
 def _detector(dictionary: str) -> cv2.aruco.ArucoDetector:
@@ -105,6 +114,35 @@ def detect_markers(
         Detection(marker_id, corners, float(sigma))
         for (marker_id, _), corners, sigma in zip(found, *refined, strict=True)
     ]
+
+
+def measured_at(grey: Bytes, detections: list[Detection], tone: float) -> list[Detection]:
+    """The same markers with their corners measured anew in the linear light of ``grey`` (H, W) to the power ``tone``."""
+    if not detections:
+        return []
+    light = np.power(linear_from_srgb(grey), np.float32(tone))
+    refined = refine_corners(light, np.stack([d.corners_px for d in detections]))
+    return [
+        Detection(d.marker_id, corners, float(sigma)) for d, corners, sigma in zip(detections, *refined, strict=True)
+    ]
+
+
+def tone_of(greys: list[Bytes], detections: list[list[Detection]], dictionary: str, *, workers: int = 1) -> float:
+    """The power of linear light (:mod:`specimap.core.tone`) in which the edges of photos (H, W) of one camera lie where
+    they are; ``detections``: what each of them shows."""
+    number = dictionary_number(dictionary)
+
+    def growths(photo: int, trial: float) -> Floats:
+        found = measured_at(greys[photo], detections[photo], trial)
+        light = np.power(linear_from_srgb(greys[photo]), np.float32(trial))
+        return shift_of_cells(light, np.array([d.corners_px for d in found]), [d.marker_id for d in found], number)
+
+    # Those that show most, and no more of them than it takes.
+    order = sorted(range(len(greys)), key=lambda photo: -sum(d.edge_px for d in detections[photo]))[:TONE_PHOTOS]
+    jobs = [(photo, trial) for trial in TRIALS for photo in order]
+    with ThreadPoolExecutor(workers) as pool:
+        found = list(pool.map(lambda job: growths(*job), jobs))
+    return tone_between([np.concatenate(found[k : k + len(order)]) for k in (0, len(order))]) if order else 1.0
 
 
 def _collect(

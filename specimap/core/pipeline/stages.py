@@ -34,6 +34,7 @@ from specimap.core.reconstruct.backend import ReconstructionBackend, corners_in_
 from specimap.core.reconstruct.breathing import settle_breathing
 from specimap.core.reconstruct.depth import DepthMap, volume_over
 from specimap.core.reconstruct.learned.required import check_required
+from specimap.core.reconstruct.resolution import at_own_resolution
 from specimap.core.refine import Refined, pixel_footprint_mm, refine_mesh
 from specimap.core.render import Grid, extent_of, render_grid
 from specimap.core.surface import fuse
@@ -84,6 +85,7 @@ def reconstruct_stage(
         detections = detect_in_photos(
             photos, settings.reconstruct.dictionary, workers=workers, progress=lambda s: progress(0.08 + 0.12 * s)
         )
+        photos, detections = at_own_resolution(photos, detections, workers=workers)
         corners = corners_in_photos(photos, detections, settings.reconstruct.dictionary)
         photos, corners, zooms = settle_breathing(
             photos, corners, edge_mm=settings.adjust.edge_mm, focal_px=stated_focal_px(photos), workers=workers
