@@ -19,6 +19,7 @@ class FakeCube:
     to_reflectance: float | None = 1e-4
     quantity: str = "reflectance"
     bad: tuple[int, ...] = ()
+    saturation: NDArray[np.float64] | None = None
     fails_at: int | None = None
     error: Exception = field(default_factory=lambda: RuntimeError("the cube broke"))
 

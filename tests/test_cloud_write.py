@@ -71,21 +71,58 @@ def test_several_shards(tmp_path: Path, cube: FakeCube, points: CloudPoints, mon
     assert heard[-1] == 1
 
 
-def test_float_reflectance_is_scaled_clipped_and_flagged(tmp_path: Path) -> None:
+def flagged(cloud: Cloud, flag: Flag) -> set[tuple[int, int]]:
+    return {(int(r), int(c)) for r, c in cloud.hsi_pixel[(cloud.flags & flag) > 0]}
+
+
+def test_float_reflectance_keeps_what_is_negative_large_or_missing(tmp_path: Path) -> None:
     values = np.random.default_rng(0).random((20, 20, 5)).astype(np.float32)
-    values[3, 4] = [np.nan, 0.5, -0.2, 7.0, 0.1]
+    values[3, 4] = [np.nan, 0.5, -0.2, 6.2, 0.1]
     values[5, 6, 1] = np.inf
     values[7, 8, 2] = -np.inf
     values[9, 9, 4] = np.nan  # in a bad band: no flag
     points = scene(20, 20, share=1)
-    write_cloud(tmp_path / "c.zarr", points, FakeCube(values, to_reflectance=1.0, bad=(4,)), {})
+    written = write_cloud(tmp_path / "c.zarr", points, FakeCube(values, to_reflectance=1.0, bad=(4,)), {})
     cloud = Cloud.open(tmp_path / "c.zarr")
     row, col = cloud.hsi_pixel.astype(int).T
-    want = np.clip(np.nan_to_num(values[row, col], nan=0.0, posinf=6.5535), 0, 6.5535)
-    assert np.abs(cloud.spectra(slice(None)) - want).max() < 0.5001e-4
-    flagged = {tuple(p) for p in cloud.hsi_pixel[(cloud.flags & Flag.SATURATED) > 0].tolist()}
-    assert flagged == {(3, 4), (5, 6), (7, 8)}
+    want = np.where(np.isfinite(values), values, np.nan)[row, col]
+    got = cloud.spectra(slice(None))
+    np.testing.assert_allclose(got, want, rtol=0, atol=0.5001e-4)
+    assert int(np.isnan(got).sum()) == 4
+    assert flagged(cloud, Flag.NO_DATA) == {(3, 4), (5, 6), (7, 8)}
+    assert flagged(cloud, Flag.SATURATED) == set()
+    assert (written.no_data, written.saturated, written.clipped_below, written.clipped_above) == (3, 0, 0, 0)
+    assert [code for code, _ in written.remarks()] == ["points_no_data"]
     assert cloud.bad_bands.tolist() == [False] * 4 + [True]
+
+
+def test_few_values_far_beyond_all_others_are_clipped_counted_and_flagged(tmp_path: Path) -> None:
+    values = np.random.default_rng(0).random((70, 60, 5)).astype(np.float32)
+    values[3, 4, 1] = 40.0
+    values[8, 8, 2] = -2.0
+    values[9, 8, 2] = 1e6
+    values[9, 9, 2] = -1e6
+    written = write_cloud(tmp_path / "c.zarr", scene(70, 60, 1.0), FakeCube(values, to_reflectance=1.0), {})
+    cloud = Cloud.open(tmp_path / "c.zarr")
+    assert cloud.scale_factor == 1e-4
+    assert (written.clipped_below, written.clipped_above, written.absurd) == (1, 1, 2)
+    codes = [code for code, _ in written.remarks()]
+    assert codes == ["points_no_data", "values_absurd", "values_clipped", "values_clipped"]
+    assert flagged(cloud, Flag.SATURATED) == {(3, 4)}
+    assert flagged(cloud, Flag.NO_DATA) == {(9, 8), (9, 9)}
+    row, col = cloud.hsi_pixel.astype(int).T
+    want = np.clip(np.where(np.abs(values) > 1e5, np.nan, values)[row, col], written.least, written.largest)
+    np.testing.assert_allclose(cloud.spectra(slice(None)), want, rtol=0, atol=0.503e-4)
+
+
+def test_reflectance_far_above_one_is_kept_in_coarser_steps(tmp_path: Path) -> None:
+    values = (100 * np.random.default_rng(0).random((30, 20, 5))).astype(np.float32)
+    written = write_cloud(tmp_path / "c.zarr", scene(30, 20, 1.0), FakeCube(values, to_reflectance=1.0), {})
+    cloud = Cloud.open(tmp_path / "c.zarr")
+    row, col = cloud.hsi_pixel.astype(int).T
+    assert 99 / 65534 < cloud.scale_factor < 101 / 65534
+    assert (written.clipped_below, written.clipped_above) == (0, 0)
+    np.testing.assert_allclose(cloud.spectra(slice(None)), values[row, col], rtol=0, atol=0.51 * cloud.scale_factor)
 
 
 def test_integer_reflectance_of_another_scale(tmp_path: Path) -> None:
@@ -93,8 +130,8 @@ def test_integer_reflectance_of_another_scale(tmp_path: Path) -> None:
     write_cloud(tmp_path / "c.zarr", scene(17, 18), FakeCube(values, to_reflectance=1 / 4095), {})
     cloud = Cloud.open(tmp_path / "c.zarr")
     row, col = cloud.hsi_pixel.astype(int).T
-    want = np.maximum(values[row, col] / 4095, 0)
-    assert np.abs(cloud.spectra(slice(None)) - want).max() < 0.51e-4
+    assert np.abs(cloud.spectra(slice(None)) - values[row, col] / 4095).max() < 0.51e-4
+    assert cloud.fill_value is None
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,8 @@ from specimap_client import Client, Cloud
 
 
 def tissue(cloud: Cloud) -> np.ndarray:
-    """Points on the specimen, neither on a card nor saturated nor occluded."""
-    return np.flatnonzero((cloud.flags & 1 > 0) & (cloud.flags & (2 | 8 | 32) == 0))
+    """Points on the specimen, neither on a card nor saturated nor occluded, with a value in every good band."""
+    return np.flatnonzero((cloud.flags & 1 > 0) & (cloud.flags & (2 | 8 | 32 | 128) == 0))
 
 
 with Client() as client:

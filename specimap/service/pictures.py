@@ -85,7 +85,7 @@ def band_index(cloud: Cloud, given: str) -> int:
 
 
 def read_bands(cloud: Cloud, bands: list[int]) -> NDArray[np.float32]:
-    """Decoded values (S, n) of some bands, in one pass over the cloud."""
+    """Decoded values (S, n) of some bands, NaN where there is none, in one pass over the cloud."""
     stored = np.empty((cloud.n_points, len(bands)), np.uint16)
     for part, block in cloud.iter_chunks(_BLOCK):
         stored[part] = block[:, bands]
@@ -98,24 +98,24 @@ def paint_rgb(cloud: Cloud) -> Painted:
 
 
 def paint_band(cloud: Cloud, band: int, limits: tuple[float, float] | None) -> Painted:
-    """One band in grey, between ``limits`` or its own percentiles."""
+    """One band in grey, between ``limits`` or its own percentiles; points without a value are not shown."""
     values = read_bands(cloud, [band])[:, 0]
     limits = limits or _percentiles(values)
-    return Painted(_levels(values, limits), range=limits)
+    return Painted(_levels(values, limits), _known(values), limits)
 
 
 def paint_composite(cloud: Cloud, bands: tuple[int, int, int]) -> Painted:
-    """Three bands as red, green and blue, each between its own percentiles."""
+    """Three bands as red, green and blue, each between its own percentiles; points that lack one are not shown."""
     values = read_bands(cloud, list(bands))
     channels = [_levels(values[:, i], _percentiles(values[:, i])) for i in range(3)]
-    return Painted(np.stack(channels, 1))
+    return Painted(np.stack(channels, 1), _known(values.sum(1)))
 
 
 def paint_index(cloud: Cloud, a: int, b: int, limits: tuple[float, float] | None) -> Painted:
     """(a - b) / (a + b) of two bands as a colour scale; points where a + b is not positive are not shown."""
     values = read_bands(cloud, [a, b]).astype(np.float64)
     total = values.sum(1)
-    shown = total > 0
+    shown = total > 0  # False for NaN, too
     index = np.divide(values[:, 0] - values[:, 1], total, out=np.zeros(len(total)), where=shown)
     limits = limits or _percentiles(index[shown])
     return Painted(_scale()[_levels(index, limits)], shown, limits)
@@ -158,7 +158,14 @@ def _over(cloud: Cloud, colours: NDArray[np.float32], drawn: NDArray[np.bool_]) 
     return np.rint(np.where(drawn[:, None], grey + (1 - DIM) * colours, grey)).astype(np.uint8)
 
 
+def _known(values: Array) -> NDArray[np.bool_] | None:
+    """Which of the values (S,) are some; None where all are."""
+    known = ~np.isnan(values)
+    return None if known.all() else known
+
+
 def _percentiles(values: Array) -> tuple[float, float]:
+    values = values[~np.isnan(values)]
     if not values.size:
         return 0.0, 0.0
     low, high = np.percentile(values, STRETCH_PERCENT)
@@ -166,11 +173,12 @@ def _percentiles(values: Array) -> tuple[float, float]:
 
 
 def _levels(values: Array, limits: tuple[float, float]) -> NDArray[np.uint8]:
-    """0..255 between the limits; 128 everywhere where these are the same."""
+    """0..255 between the limits; 128 everywhere where these are the same, 0 for NaN."""
     low, high = limits
     if not high > low:
         return np.full(len(values), 128, np.uint8)
-    return np.rint(np.clip((values - low) * (255 / (high - low)), 0, 255)).astype(np.uint8)
+    levels = np.clip((values - low) * (255 / (high - low)), 0, 255)
+    return np.rint(np.nan_to_num(levels)).astype(np.uint8)
 
 
 @lru_cache(maxsize=1)

@@ -142,7 +142,7 @@ class SpectraAnswer(BaseModel):
     bands: list[int]
     wavelength_nm: list[float | None]
     indices: list[int]
-    spectra: list[list[float]]
+    spectra: list[list[float | None]] = Field(description="Null where a point has no value; NaN in Arrow and NumPy.")
     fields: dict[str, list[float | int | list[float | int] | None]]
 
 
@@ -161,7 +161,7 @@ class Point(BaseModel):
     quantity: str = Field(description="What the spectrum is: `reflectance`, or `counts`.")
     bands: list[int]
     wavelength_nm: list[float | None]
-    spectrum: list[float]
+    spectrum: list[float | None] = Field(description="Null where it has no value.")
 
 
 class BandAnswer(BaseModel):
@@ -170,7 +170,7 @@ class BandAnswer(BaseModel):
     band: int
     wavelength_nm: float | None
     quantity: str
-    values: list[float]
+    values: list[float | None] = Field(description="Null where a point has no value; NaN in Arrow and NumPy.")
 
 
 # ---- what a request means -----------------------------------------------------------------------------

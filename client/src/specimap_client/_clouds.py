@@ -100,7 +100,7 @@ class Cloud:
 
         One of ``indices``, ``pixels`` [(row, column), ...], ``polygon`` [(row, column), ...], ``box`` (low, high),
         ``radius`` (centre, mm), ``nearest`` (place, k). Bands by ``nm`` (from, to) or ``bands`` numbers; without
-        them all. ``fields`` of the points, such as ``("xyz", "flags")``, come along.
+        them all. ``fields`` of the points, such as ``("xyz", "flags")``, come along. NaN where a point has no value.
 
         Raises:
             ValueError: that is not exactly one selection.
@@ -119,7 +119,7 @@ class Cloud:
         return Point.of(self._session.json("GET", path("clouds", self.id, "points", index)))
 
     def band(self, band: int) -> NDArray[np.float32]:
-        """One band of all points, (S,)."""
+        """One band of all points, (S,); NaN where a point has no value."""
         headers = {"Accept": _spectra_answers.NPY}
         answer = self._session.request("GET", path("clouds", self.id, "bands", band), headers=headers)
         return _spectra_answers.npy_of(answer).astype(np.float32, copy=False).reshape(-1)
@@ -154,7 +154,7 @@ class Cloud:
     @cached_property
     def flags(self) -> NDArray[np.uint8]:
         """(S,) bits: 1 specimen, 2 marker card, 4 grazing, 8 saturated, 16 depth interpolated, 32 occluded,
-        64 undercut."""
+        64 undercut, 128 no data (a good band has no value)."""
         return self._array("flags", np.uint8)
 
     def zarr(self) -> zarr.Group:

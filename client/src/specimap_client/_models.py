@@ -189,7 +189,7 @@ class Point(Model):
     labels: dict[str, Any]
     quantity: str
     wavelength_nm: tuple[float | None, ...]
-    spectrum: tuple[float, ...]
+    spectrum: tuple[float | None, ...]
 
 
 @dataclass(frozen=True)

@@ -114,6 +114,12 @@ class CloudArrays:
         return _number(self._spectra.attributes.get("add_offset"), 0.0)
 
     @property
+    def fill_value(self) -> int | None:
+        """The stored value that stands for none; None where each one is a value."""
+        value = self._spectra.attributes.get("_FillValue")
+        return value if isinstance(value, int) else None
+
+    @property
     def bad_bands(self) -> NDArray[np.bool_]:
         """Bands (B,) that the cube's file or its noise declared useless."""
         mask = np.zeros(self.bands, bool)

@@ -29,12 +29,15 @@ class Cloud(CloudArrays):
     # ---- spectra --------------------------------------------------------------------------------------
 
     def decode(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
-        """Stored values as reflectance, or as the counts the cube held."""
-        values = stored.astype(np.float32)
-        if self.scale_factor != 1:
-            values *= np.float32(self.scale_factor)
-        if self.add_offset != 0:
-            values += np.float32(self.add_offset)
+        """Stored values as reflectance, or as the counts the cube held; NaN where there is none."""
+        if self.add_offset != 0:  # a difference of large numbers: float32 would lose digits
+            values = (stored * self.scale_factor + self.add_offset).astype(np.float32)
+        else:
+            values = stored.astype(np.float32)
+            if self.scale_factor != 1:
+                values *= np.float32(self.scale_factor)
+        if self.fill_value is not None:
+            values[stored == self.fill_value] = np.nan
         return values
 
     def spectra(

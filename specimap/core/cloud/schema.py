@@ -15,7 +15,9 @@ TILE = 16
 CHUNK_POINTS = 256
 SHARD_POINTS = 131072
 SCALE_FACTOR = 1e-4
-"""Stored value times this is reflectance."""
+"""Stored value times this is reflectance, where nothing else is said."""
+NO_VALUE = 65535
+"""Stored where there is no value, in clouds whose ``spectra`` have the attribute ``_FillValue``."""
 
 
 class Flag(IntFlag):
@@ -26,12 +28,14 @@ class Flag(IntFlag):
     GRAZING = 4
     """The cube's ray meets the surface at more than 70 degrees from its normal."""
     SATURATED = 8
-    """A good band of the raw spectrum is at the largest value it can have, or is not a finite number."""
+    """A good band reads as much as the sensor can, or more than can be stored."""
     DEPTH_INTERPOLATED = 16
     OCCLUDED = 32
     """Tissue stands between this place and the cube's camera: the spectrum is of the tissue in front (homography)."""
     UNDERCUT = 64
     """Other tissue stands above this place: top views and grids do not show it; the spectrum is its own (camera)."""
+    NO_DATA = 128
+    """A good band has no value: the file's no-data value, a dead detector element, or no finite number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +60,9 @@ class CloudPoints:
 class SpectraSource(Protocol):
     """Where the spectra come from: a cube on disk.
 
-    ``wavelengths_nm`` (B,), NaN where unknown; ``bad_bands`` (B,); ``to_reflectance`` times a raw value is
-    reflectance, None where the values are something else, which ``quantity`` names.
+    ``wavelengths_nm`` (B,), NaN where unknown; ``bad_bands`` (B,); ``to_reflectance`` times a value is reflectance,
+    None where the values are something else, which ``quantity`` names. A value that is not finite is none.
+    ``saturation``: values from it on are saturated, (), (B,) or (cols, B); NaN or None where that is unknown.
     """
 
     @property
@@ -73,12 +78,14 @@ class SpectraSource(Protocol):
     @property
     def quantity(self) -> str: ...
     @property
+    def saturation(self) -> NDArray[np.float64] | None: ...
+    @property
     def wavelengths_nm(self) -> NDArray[np.float64]: ...
     @property
     def bad_bands(self) -> NDArray[np.bool_]: ...
 
     def read_rows(self, start: int, stop: int) -> Array:
-        """Raw values (stop - start, cols, bands), C-contiguous, native byte order."""
+        """Values (stop - start, cols, bands), C-contiguous, native byte order."""
 
 
 @dataclass(frozen=True)

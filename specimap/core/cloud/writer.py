@@ -18,7 +18,7 @@ import tensorstore
 from numpy.typing import NDArray
 
 from specimap import __version__
-from specimap.core.cloud.encoding import Encoding, Gatherer, strips
+from specimap.core.cloud.encoding import Encoding, Gatherer, Tally, strips
 from specimap.core.cloud.schema import (
     ARRAYS,
     SHARD_POINTS,
@@ -28,6 +28,7 @@ from specimap.core.cloud.schema import (
     chunk_bounds,
     tile_order,
 )
+from specimap.core.cloud.written import Written
 from specimap.core.errors import RegistrationError
 from specimap.core.files import atomic_path
 from specimap.core.geometry import Array
@@ -39,20 +40,21 @@ def write_cloud(
     path: Path,
     points: CloudPoints,
     source: SpectraSource,
-    attributes: Mapping[str, object],
+    attributes: Mapping[str, object] | Callable[[Written], Mapping[str, object]],
     *,
     progress: Callable[[float], None] | None = None,
     saturation: float | None = None,
     durable: bool = False,
-) -> None:
+) -> Written:
     """Write the cloud of ``points`` with the spectra of ``source`` to the group ``path``, replacing it.
 
-    The points are brought to the order of 16x16 tiles. Reflectance is stored times 10000, clipped to 0..65535;
-    a value that is not a number becomes 0, and its point is flagged SATURATED if the band is good. Counts are
-    stored as they are where they fit 16 bits, else scaled as the attributes of ``spectra`` say.
+    The points are brought to the order of 16x16 tiles. Reflectance is stored in steps of 1e-4, counts as they are where
+    they fit 16 bits; ``scale_factor`` and ``add_offset`` of ``spectra`` decode both, and hold negative and large values
+    too. What is no finite number is stored as ``_FillValue``; its point is flagged NO_DATA if the band is good. Few
+    values far beyond all others are clipped and counted.
 
-    ``attributes`` go to the group, beside version, frame, units and bad bands. ``saturation``: the raw value
-    from which a band counts as saturated (default: the largest of an integer type). ``progress`` hears
+    ``attributes`` go to the group, beside version, frame, units and bad bands; they may depend on what was found.
+    ``saturation``: the value from which a band counts as saturated (default: the source's). ``progress`` hears
     fractions up to 1. ``durable`` waits until the disk has it all, which can double the time.
 
     Raises RegistrationError without points, ValueError for points that do not fit each other or the cube,
@@ -65,8 +67,8 @@ def write_cloud(
     with atomic_path(path) as group, _storage_errors():
         group.mkdir()
         encoding = Encoding.of(source)
-        saturated = _write_spectra(group, points, source, encoding, saturation, durable, progress)
-        flags = points.flags | np.where(saturated, np.uint8(Flag.SATURATED), np.uint8(0))
+        found, tally = _write_spectra(group, points, source, encoding, saturation, durable, progress)
+        flags = points.flags | found
         for name, values in vars(replace(points, flags=flags)).items():
             _write_array(group, name, values, durable)
         _write_array(group, "chunk_aabb", chunk_bounds(points.xyz), durable)
@@ -78,9 +80,25 @@ def write_cloud(
             "bad_bands": np.flatnonzero(source.bad_bands),
             "cube_shape": (source.rows, source.cols, source.bands),
         }
-        _write_group_metadata(group, own | dict(attributes))
+        written = _written(found, tally, encoding)
+        given = attributes(written) if callable(attributes) else attributes
+        _write_group_metadata(group, own | dict(given))
     if progress:
         progress(1.0)
+    return written
+
+
+def _written(flags: NDArray[np.uint8], tally: Tally, encoding: Encoding) -> Written:
+    return Written(
+        points=len(flags),
+        saturated=int(((flags & Flag.SATURATED) > 0).sum()),
+        no_data=int(((flags & Flag.NO_DATA) > 0).sum()),
+        clipped_below=tally.below,
+        clipped_above=tally.above,
+        absurd=tally.absurd,
+        least=encoding.add_offset,
+        largest=encoding.add_offset + encoding.top * encoding.scale_factor,
+    )
 
 
 def _checked(points: CloudPoints, source: SpectraSource) -> CloudPoints:
@@ -113,26 +131,26 @@ def _write_spectra(
     saturation: float | None,
     durable: bool,
     progress: Callable[[float], None] | None,
-) -> NDArray[np.bool_]:
-    """Write the array ``spectra``; which points are saturated, (S,)."""
+) -> tuple[NDArray[np.uint8], Tally]:
+    """Write the array ``spectra``; the flags (S,) that the spectra set, and what was clipped."""
     size = len(points)
     gatherer = Gatherer(source, encoding, saturation)
-    saturated = np.empty(size, bool)
+    flags = np.empty(size, np.uint8)
     with _create(group, "spectra", (size, source.bands), encoding.attributes(), durable) as array:
         for raw, start, take in _strips_in_tile_order(points.hsi_pixel, source):
             stop = start + len(take)
             block = np.empty((len(take), source.bands), np.uint16)
-            saturated[start:stop] = gatherer.gather(raw, take, block)
+            flags[start:stop] = gatherer.gather(raw, take, block)
             array.write(start, block)
             if progress:
                 progress(0.95 * stop / size)
-    return saturated
+    return flags, gatherer.tally
 
 
 def _strips_in_tile_order(
     pixels: NDArray[np.uint16], source: SpectraSource
 ) -> Iterator[tuple[Array, int, NDArray[np.intp]]]:
-    """Raw values (m, B) of each strip of tiles that has points, its first point, its points' rows in them."""
+    """Values (m, B) of each strip of tiles that has points, its first point, its points' rows in them."""
     row = pixels[:, 0]
     for first_row, stop_row in strips(source):
         # Points are in the order of tiles, so the rows of tiles increase, though the rows in them do not.

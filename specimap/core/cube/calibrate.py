@@ -18,6 +18,8 @@ from specimap.core.cube.wavelengths import Warnings
 from specimap.core.errors import CubeContentError
 from specimap.core.geometry import Array, Floats
 
+# Fewer columns x bands of a saturated white than this are dead elements.
+_LEAST_CLIPPED_WHITE = 0.002
 # Wider apart than a band of any imager: the reference was taken with other settings.
 _WAVELENGTH_TOLERANCE_NM = 1.0
 
@@ -25,12 +27,16 @@ _WAVELENGTH_TOLERANCE_NM = 1.0
 def calibrated(raw: Cube, white: Cube, dark: Cube | None) -> Cube:
     """The cube of reflectance (float32) of a raw cube. Without a dark reference, 0 counts are taken as dark.
 
-    Where the white is not brighter than the dark, reflectance is NaN. Raises CubeContentError for a reference
-    whose columns or bands do not fit.
+    Where the white is not brighter than the dark, or a reference has no value, reflectance is NaN. Saturation stays
+    that of the raw counts. Raises CubeContentError for a reference whose columns or bands do not fit.
     """
     warnings: Warnings = _fit(raw, white, "white") + (_fit(raw, dark, "dark") if dark else ())
+    scales, about_units = _to_common_units(raw, white, dark)
+    warnings += about_units
     white_line = _mean_line(white)
-    dark_line = np.zeros_like(white_line) if dark is None else _mean_line(dark)
+    warnings += _saturated(white, white_line)
+    white_line *= scales[0]
+    dark_line = np.zeros_like(white_line) if dark is None else _mean_line(dark) * scales[1]
     if dark is None:
         warnings += (("dark_missing", "No dark reference was given; a dark signal of zero is assumed."),)
     span = np.broadcast_to(white_line - dark_line, (raw.cols, raw.bands))
@@ -51,12 +57,14 @@ def calibrated(raw: Cube, white: Cube, dark: Cube | None) -> Cube:
         np.broadcast_to(dark_line, span.shape).astype(np.float32),
         gain.astype(np.float32),
     )
+    level = None if raw.saturation is None else pixels.calibrated(raw.saturation.astype(np.float32))
     return replace(
         raw,
         pixels=pixels,
         files=raw.files + white.files + (dark.files if dark else ()),
         quantity="reflectance",
         to_reflectance=1.0,
+        saturation=None if level is None else level.astype(np.float64),
         warnings=raw.warnings + warnings,
     )
 
@@ -78,6 +86,30 @@ def _fit(raw: Cube, reference: Cube, name: str) -> Warnings:
     return ()
 
 
+def _to_common_units(raw: Cube, white: Cube, dark: Cube | None) -> tuple[tuple[float, float], Warnings]:
+    """What values of white and dark are multiplied by to be in the units of the raw cube, and a warning."""
+    own = [cube.to_reflectance for cube in (raw, white, dark or white)]
+    if all(factor is None for factor in own):
+        return (1.0, 1.0), ()
+    if any(factor is None for factor in own):
+        text = "Cube and references are not of the same kind: some are counts, some reflectance already."
+        return (1.0, 1.0), (("reference_units_differ", text),)
+    raw_factor, white_factor, dark_factor = (factor or 1.0 for factor in own)
+    return (white_factor / raw_factor, dark_factor / raw_factor), ()
+
+
+def _saturated(white: Cube, line: Floats) -> Warnings:
+    """A warning where the white reference itself clips, on average over its rows, in a good band."""
+    if white.saturation is None:
+        return ()
+    with np.errstate(invalid="ignore"):
+        clipped = (line >= white.saturation)[:, ~white.bad_bands]
+    share = float(clipped.mean()) if clipped.size else 0.0
+    if share <= _LEAST_CLIPPED_WHITE:
+        return ()
+    return (("white_saturated", f"The white reference is saturated in {share:.1%} of its columns x bands."),)
+
+
 def _mean_line(reference: Cube) -> Floats:
     """Mean over the rows, (cols, bands), NaN left out; NaN where there is nothing else."""
     total = np.zeros((reference.cols, reference.bands))
@@ -85,7 +117,7 @@ def _mean_line(reference: Cube) -> Floats:
     step = reference.pixels.strip_rows()
     for start in range(0, reference.rows, step):
         strip = reference.read_rows(start, min(start + step, reference.rows))
-        known = ~np.isnan(strip)
+        known = np.isfinite(strip)
         total += np.where(known, strip, 0).sum(0, dtype=np.float64)
         count += known.sum(0)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
@@ -98,7 +130,10 @@ class _CalibratedPixels(Pixels):
         self._raw, self._dark, self._gain = raw, dark, gain
 
     def block(self, start: int, stop: int) -> Array:
-        raw = to_bip(self._raw.block(start, stop))
+        return self.calibrated(to_bip(self._raw.block(start, stop)))
+
+    def calibrated(self, raw: Array) -> Array:
+        """Raw values, of a shape that broadcasts to (cols, bands), as reflectance."""
         out = np.subtract(raw, self._dark, dtype=np.float32, casting="same_kind")
         out *= self._gain
         return out

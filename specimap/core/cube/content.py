@@ -5,32 +5,31 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap.core.cube.model import Cube, sampled_rows
+from specimap.core.cube.model import Cube
+from specimap.core.cube.outliers import saturated_share
+from specimap.core.cube.pixels import sampled_rows
 from specimap.core.cube.wavelengths import Warnings
 from specimap.core.errors import CubeContentError
 from specimap.core.geometry import Array
 
 _SAMPLED_ROWS = 24
 _SAMPLED_PIXELS = 24 * 512
-# Values within this share below the largest one: a scene thins out there, a clipped sensor does not.
-_TOP_SHARE = 0.01
-# As many values on the largest one are no chance, but a plateau.
-_LEAST_PLATEAU = 8
 # Fewer pixels at the largest value than this are glints or dead pixels, no saturation worth a word.
 _LEAST_SATURATED_SHARE = 0.001
+_LEAST_ZERO_SHARE = 0.002
 
 
 def inspect(cube: Cube, mean: NDArray[np.float32]) -> Warnings:
     """Warnings (code, sentence) about a cube's values; ``mean`` (rows, cols) is its mean image.
 
-    Codes: ``single_band``, ``bands_all_zero``, ``pixels_nan``, ``values_nan``, ``saturated``. Raises
+    Codes: ``single_band``, ``bands_all_zero``, ``pixels_nan``, ``values_nan``, ``pixels_zero``, ``saturated``. Raises
     CubeContentError for a cube without finite values, or whose values are all the same.
     """
     if not np.isfinite(mean).any():
         raise CubeContentError(
             f"{cube.path.name} holds no finite value.", advice="Export the cube again; check its data type."
         )
-    sample = _sample(cube)
+    sample, columns = _sample(cube)
     finite = sample[np.isfinite(sample)]
     if np.ptp(mean[np.isfinite(mean)]) == 0 and (not finite.size or np.ptp(finite) == 0):
         raise CubeContentError(
@@ -47,38 +46,34 @@ def inspect(cube: Cube, mean: NDArray[np.float32]) -> Warnings:
     lost = int(np.isnan(mean).sum())
     if lost:
         warnings.append(("pixels_nan", f"{lost} of {mean.size} pixels hold no value in any good band."))
-    holes = float(np.isnan(sample[..., ~cube.bad_bands]).mean()) if sample.dtype.kind == "f" else 0.0
-    if holes > lost / mean.size:
-        warnings.append(("values_nan", f"About {holes:.2%} of the values are missing (NaN)."))
-    share = saturated_share(sample[..., ~cube.bad_bands])
+    zero_pixels = int((mean == 0).sum())
+    if zero_pixels > _LEAST_ZERO_SHARE * mean.size:
+        text = f"{zero_pixels} of {mean.size} pixels are zero in all good bands, as where nothing was recorded."
+        warnings.append(("pixels_zero", f"{text} The file names no no-data value that says so."))
+    if sample.dtype.kind == "f":
+        missing = np.isnan(sample[..., ~cube.bad_bands])
+        partly = missing & ~missing.all(-1, keepdims=True)
+        holes = float(partly.mean())
+    else:
+        holes = 0.0
+    if holes:
+        warnings.append(("values_nan", f"About {holes:.2%} of the values are missing in pixels that have others."))
+    share = saturated_share(sample[..., ~cube.bad_bands], _level(cube, columns))
     if share > _LEAST_SATURATED_SHARE:
         warnings.append(("saturated", f"About {share:.1%} of the pixels are saturated in at least one band."))
     return tuple(warnings)
 
 
-def _sample(cube: Cube) -> Array:
-    """Pixels of evenly spread rows and columns, (n, k, bands)."""
+def _sample(cube: Cube) -> tuple[Array, slice]:
+    """Pixels of evenly spread rows and columns, (n, k, bands); which columns."""
     rows = sampled_rows(cube.rows, _SAMPLED_ROWS)
-    step = max(1, len(rows) * cube.cols // _SAMPLED_PIXELS)
-    return np.concatenate([cube.read_rows(r, r + 1)[:, ::step] for r in rows])
+    columns = slice(None, None, max(1, len(rows) * cube.cols // _SAMPLED_PIXELS))
+    return np.concatenate([cube.read_rows(r, r + 1)[:, columns] for r in rows]), columns
 
 
-def saturated_share(spectra: Array) -> float:
-    """Share of the spectra (..., bands) with a value at which the sensor clips; 0 where none is found.
-
-    The largest value counts as a clip if it is the integer type's own, or if more values lie on it than in
-    the whole hundredth below it: a plateau.
-    """
-    finite = spectra[np.isfinite(spectra)]
-    if not finite.size:
-        return 0.0
-    top = finite.max()
-    at_top = int((finite == top).sum())
-    clips = spectra.dtype.kind in "iu" and top == np.iinfo(spectra.dtype).max
-    if not clips:
-        depth = float(top) * _TOP_SHARE
-        if spectra.dtype.kind in "iu":
-            depth = max(depth, 1.0)  # of few grey levels the next one must count
-        below = int((finite >= float(top) - depth).sum()) - at_top
-        clips = top > 0 and at_top >= _LEAST_PLATEAU and at_top > below
-    return float((spectra == top).any(-1).mean()) if clips else 0.0
+def _level(cube: Cube, columns: slice) -> Array | None:
+    """The level of saturation of these columns' good bands, as it broadcasts to (k, good bands)."""
+    level = cube.saturation
+    if level is None or level.ndim == 0:
+        return level
+    return level[~cube.bad_bands] if level.ndim == 1 else level[columns][:, ~cube.bad_bands]

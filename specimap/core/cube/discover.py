@@ -171,6 +171,16 @@ def choose_wavelengths(variables: Sequence[Variable], cube: Variable) -> Variabl
     return replace(best, units=nearest.text if nearest else _units_in_name(best.short_name))
 
 
+def arrays_beside(variables: Sequence[Variable], cube: Variable) -> list[Variable]:
+    """Numbers and vectors of the cube's own group: one number, or one for each of its rows, columns or bands."""
+    return [
+        v
+        for v in variables
+        if _group(v) == _group(cube) and v.text is None and readable_dtype(v.dtype)
+        and math.prod(v.shape) in (1, *cube.shape)
+    ]  # fmt: skip
+
+
 def _spectral_vectors(variables: Sequence[Variable]) -> list[Variable]:
     vectors = [
         v

@@ -69,7 +69,7 @@ class EnviFormat:
             wavelengths=header.wavelengths,
             units=header.wavelength_units,
             bad_band_list=header.bad_band_list,
-            to_reflectance=header.to_reflectance,
+            declared=header.declared,
             warnings=header.warnings + warnings,
         )
 

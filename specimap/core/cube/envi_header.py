@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from specimap.core.cube.declared import WORDS, Declared, check_counts, declared_of, plain
 from specimap.core.cube.shown import shown
 from specimap.core.cube.spectral_units import read_unit
 from specimap.core.cube.wavelengths import Warnings
@@ -58,7 +59,7 @@ class EnviHeader:
     wavelengths: Floats | None
     wavelength_units: str | None
     bad_band_list: Floats | None
-    to_reflectance: float | None
+    declared: Declared
     warnings: Warnings
 
     @property
@@ -190,7 +191,7 @@ class _Reader:
             wavelengths=self._numbers("wavelength"),
             wavelength_units=self._wavelength_units(),
             bad_band_list=self._numbers("bbl"),
-            to_reflectance=self._to_reflectance(),
+            declared=self._declared(bands),
             warnings=warnings,
         )  # fmt: skip
 
@@ -255,14 +256,8 @@ class _Reader:
             return axis
         return units
 
-    def _to_reflectance(self) -> float | None:
-        field = "reflectance scale factor"
-        if field not in self._fields:
-            return None
-        try:
-            factor = float(self._required(field))
-        except ValueError:
-            raise self._wrong(field, "is not a number") from None
-        if not (math.isfinite(factor) and factor > 0):
-            raise self._wrong(field, "is not a positive number")
-        return 1.0 / factor
+    def _declared(self, bands: int) -> Declared:
+        fields = {key: value.partition(";")[0] for key, value in self._fields.items() if plain(key) in WORDS}
+        declared = declared_of(self._name, fields)
+        check_counts(self._name, declared, bands)
+        return declared

@@ -6,12 +6,13 @@ Whatever is read of a file passes :mod:`specimap.core.cube.hdf_guard`, for a str
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
 import numpy as np
 
+from specimap.core.cube.declared import WORDS, Declared, declared_of, plain
 from specimap.core.cube.discover import Variable, choose_cube, choose_wavelengths, cube_axes
 from specimap.core.cube.hdf_guard import guarded_dataset, open_guarded
 from specimap.core.cube.model import Cube, describe
@@ -28,7 +29,6 @@ _UNIT_ATTRIBUTES = ("units", "unit", "wavelength_units")
 _LONGEST_UNITS = 64
 # The label of a dimension scale that stands for an axis without coordinates.
 _NETCDF_NO_NAME = "This is a netCDF dimension"
-_SCALE_NAMES = ("reflectance scale factor", "reflectance_scale_factor", "scale_factor")
 
 
 class HdfFormat:
@@ -49,7 +49,7 @@ class HdfFormat:
                 wavelengths, values = _wavelengths(path, file, variables, cube)
                 reversed_axes = "MATLAB_class" in node.attrs
                 axes, warnings = cube_axes(cube, wavelengths, reversed_axes=reversed_axes)
-                scale = _to_reflectance(cube, node.attrs)
+                declared = _declared(path, file, node)
                 pixels = _pixels(path, node, axes)
         except OSError as error:
             sizes = _TRUNCATED.search(str(error))
@@ -66,7 +66,7 @@ class HdfFormat:
             pixels,
             wavelengths=values,
             units=wavelengths.units if wavelengths else None,
-            to_reflectance=scale,
+            declared=declared,
             warnings=about_choice + warnings,
         )
 
@@ -157,17 +157,18 @@ def _text(value: object) -> str | None:
     return value if isinstance(value, str) else None
 
 
-def _to_reflectance(cube: Variable, attributes: Mapping[str, object]) -> float | None:
-    """The factor of a dataset that calls itself reflectance; CF multiplies by it, NEON divides."""
-    names = (cube.name, _text(attributes.get("long_name")), _text(attributes.get("standard_name")))
-    if not any("reflect" in (name or "").lower() for name in names):
-        return None
-    for name, value in attributes.items():
-        if name.lower() in _SCALE_NAMES:
-            factor = float(np.asarray(value, np.float64).ravel()[0])
-            if np.isfinite(factor) and factor > 0:
-                return 1 / factor if factor > 1 else factor
-    return None
+def _declared(path: Path, file: h5py.File, dataset: h5py.Dataset) -> Declared:
+    """What the cube's own attributes say of its values, and small data sets beside it (MATLAB keeps them so)."""
+    said: dict[str, object] = {}
+    group = dataset.parent
+    for name in group:
+        if plain(name) in WORDS and isinstance(group.get(name, getlink=True), h5py.HardLink):
+            node = group[name]
+            if isinstance(node, h5py.Dataset) and node.shape is not None and node.size in (1, *dataset.shape):
+                said[name] = guarded_dataset(path, file, node.name)[()]
+    said |= {name: value for name, value in _attributes(dataset) if plain(name) in (*WORDS, "unsigned")}
+    titles = (_text(dataset.attrs.get(title)) for title in ("long_name", "standard_name"))
+    return declared_of(path.name, said, str(dataset.name), *titles)
 
 
 def _pixels(path: Path, dataset: h5py.Dataset, axes: tuple[int, int, int]) -> Pixels:

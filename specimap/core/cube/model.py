@@ -7,32 +7,32 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap.core.cube.declared import Declared
 from specimap.core.cube.pixels import Pixels, read_bip, workers
+from specimap.core.cube.values import Quantity, settle
 from specimap.core.cube.wavelengths import Warnings, bad_band_mask, nanometres
 from specimap.core.errors import CubeHeaderError
 from specimap.core.geometry import Array, Floats
 
-Quantity = Literal["reflectance", "counts"]
-
 _HASH_CHUNK = 16 << 20
-# Reflectance of wet tissue and of references lies in 0 to 1; noise and glints reach a little beyond.
-_REFLECTANCE_RANGE = (-0.1, 2.0)
-_SAMPLED_ROWS = 4
-_SAMPLED_VALUES = 200_000
 
 
 @dataclass(frozen=True, eq=False)
 class Cube:
     """An open cube. Values stay on disk until they are asked for.
 
-    ``wavelengths_nm`` (B,) is NaN where the file names none; ``bad_bands`` (B,). ``to_reflectance`` times a
-    raw value is reflectance; None where the values are counts. ``warnings`` are (code, sentence). ``files``
-    are those whose content makes the cube, ``datasets`` what was asked for by name in them.
+    Values are as the file means them: what it stands for no value is NaN, gains and offsets are applied; only a factor
+    that is one for all bands is left to ``to_reflectance``, so that integers stay integers.
+
+    ``wavelengths_nm`` (B,) is NaN where the file names none; ``bad_bands`` (B,). ``to_reflectance`` times a value is
+    reflectance; None where the values are counts. ``saturation``: the value from which on a band counts as saturated,
+    (), (B,) or (cols, B), NaN or None where that is unknown. ``warnings`` are (code, sentence). ``files`` are those
+    whose content makes the cube, ``datasets`` what was asked for by name in them.
     """
 
     path: Path
@@ -43,6 +43,7 @@ class Cube:
     bad_bands: NDArray[np.bool_] = field(repr=False)
     quantity: Quantity
     to_reflectance: float | None
+    saturation: Floats | None = field(repr=False)
     warnings: Warnings
     datasets: tuple[str | None, ...] = ()
 
@@ -67,7 +68,7 @@ class Cube:
         return self.pixels.dtype
 
     def read_rows(self, start: int, stop: int) -> Array:
-        """Raw values (stop - start, cols, bands), C-contiguous, native byte order.
+        """Values (stop - start, cols, bands), C-contiguous, native byte order.
 
         May be a read-only view of the file. Raises IndexError outside ``0 <= start < stop <= rows``.
         """
@@ -76,13 +77,13 @@ class Cube:
         return read_bip(self.pixels, start, stop)
 
     def band(self, index: int) -> Array:
-        """Raw values of one band (rows, cols), native byte order."""
+        """Values of one band (rows, cols), native byte order."""
         if not 0 <= index < self.bands:
             raise IndexError(f"band {index} of a cube with {self.bands} bands")
         return self.pixels.band(index)
 
     def mean_image(self, bands: slice | NDArray[np.intp] | NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
-        """Mean (rows, cols) of the raw values over ``bands`` (default: all that are not bad), NaN left out.
+        """Mean (rows, cols) of the values over ``bands`` (default: all that are not bad), NaN left out.
 
         A pixel that is NaN in each of these bands is NaN. Raises ValueError when no band is chosen.
         """
@@ -147,43 +148,28 @@ def describe(
     wavelengths: Floats | None = None,
     units: str | None = None,
     bad_band_list: Floats | None = None,
-    to_reflectance: float | None = None,
+    declared: Declared | None = None,
     warnings: Warnings = (),
 ) -> Cube:
-    """A cube from what a format found: units, bad bands and the quantity are settled here for all formats."""
+    """A cube from what a format found: units, bad bands and what values mean are settled here for all formats.
+
+    Raises CubeHeaderError for gains or offsets that do not fit the bands.
+    """
     wavelengths_nm, about_wavelengths = nanometres(wavelengths, units, pixels.shape[2])
     bad_bands, about_bands = bad_band_mask(bad_band_list, pixels.shape[2])
-    if to_reflectance is None and pixels.dtype.kind == "f" and _looks_like_reflectance(pixels):
-        to_reflectance = 1.0
+    meaning = settle(path.name, pixels, bad_bands, declared or Declared())
     return Cube(
         path=path,
         format_name=format_name,
-        pixels=pixels,
+        pixels=meaning.pixels,
         files=files or (path,),
         wavelengths_nm=wavelengths_nm,
         bad_bands=bad_bands,
-        quantity="counts" if to_reflectance is None else "reflectance",
-        to_reflectance=to_reflectance,
-        warnings=warnings + about_wavelengths + about_bands,
+        quantity=meaning.quantity,
+        to_reflectance=meaning.to_reflectance,
+        saturation=meaning.saturation,
+        warnings=warnings + about_wavelengths + about_bands + meaning.warnings,
     )
-
-
-def sampled_rows(rows: int, most: int) -> list[int]:
-    """At most ``most`` row indices spread evenly over the cube."""
-    count = min(rows, most)
-    return [int((i + 0.5) * rows / count) for i in range(count)]
-
-
-def _looks_like_reflectance(pixels: Pixels) -> bool:
-    rows = sampled_rows(pixels.shape[0], _SAMPLED_ROWS)
-    step = max(1, len(rows) * pixels.shape[1] * pixels.shape[2] // _SAMPLED_VALUES)
-    values = np.concatenate([pixels.block(r, r + 1)[:, ::step] for r in rows]).astype(np.float64)
-    values = values[np.isfinite(values)]
-    if not values.size or not values.any():
-        return False
-    # Not minimum and maximum: a few dead or glinting pixels do not change what is measured.
-    low, high = np.percentile(values, (0.1, 99.9))
-    return bool(low >= _REFLECTANCE_RANGE[0] and high <= _REFLECTANCE_RANGE[1])
 
 
 _READABLE = {"u1", "u2", "u4", "u8", "i1", "i2", "i4", "i8", "f2", "f4", "f8"}

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from scipy.io import netcdf_file
 
+from specimap.core.cube.declared import Declared, declared_of
 from specimap.core.cube.discover import Variable, choose_cube, choose_wavelengths, cube_axes
 from specimap.core.cube.model import Cube, describe
 from specimap.core.cube.npy import starts_with
@@ -38,6 +40,7 @@ class NetCdf3Format:
             if wavelengths is not None:
                 values = np.array(file.variables[wavelengths.name].data, np.float64).ravel()
             array = _mapped_again(path, file.variables[cube.name].data)
+            declared = _declared(path, cube.name, vars(file.variables[cube.name])["_attributes"])
         axes, warnings = cube_axes(cube, wavelengths, reversed_axes=False)
         return describe(
             path,
@@ -45,8 +48,14 @@ class NetCdf3Format:
             ArrayPixels(array.transpose(axes)),
             wavelengths=values,
             units=wavelengths.units if wavelengths else None,
+            declared=declared,
             warnings=about_choice + warnings,
         )
+
+
+def _declared(path: Path, name: str, attributes: Mapping[str, object]) -> Declared:
+    texts = {key: value.decode("utf-8", "replace") for key, value in attributes.items() if isinstance(value, bytes)}
+    return declared_of(path.name, {**attributes, **texts}, name, texts.get("long_name"), texts.get("standard_name"))
 
 
 def _units(variable: object) -> str | None:

@@ -80,3 +80,9 @@ class ArrayPixels(Pixels):
 def read_bip(pixels: Pixels, start: int, stop: int) -> Array:
     """Rows as a C-contiguous (n, cols, bands) array in native byte order."""
     return to_bip(pixels.block(start, stop))
+
+
+def sampled_rows(rows: int, most: int) -> list[int]:
+    """At most ``most`` row indices spread evenly over the cube."""
+    count = min(rows, most)
+    return [int((i + 0.5) * rows / count) for i in range(count)]

@@ -6,6 +6,7 @@ switched off that may lead it to other files (OME, Micro-Manager, NDTiff and the
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import tifffile
 
+from specimap.core.cube.declared import WORDS, declared_of, plain
 from specimap.core.cube.discover import Variable, cube_axes
 from specimap.core.cube.model import Cube, check_dtype, describe
 from specimap.core.cube.npy import refuse_dataset, starts_with
@@ -24,6 +26,10 @@ from specimap.core.cube.wavelengths import Warnings
 from specimap.core.errors import CubeFormatError, CubeTruncatedError
 from specimap.core.geometry import Array
 
+_GDAL_METADATA, _GDAL_NODATA = 42112, 42113
+_GDAL_ITEM = re.compile(r"<Item\b[^>]*\bsample=\"(\d+)\"[^>]*>([^<]*)</Item>")
+# CF's words, which mean the same.
+_GAINS, _OFFSETS = "scale_factor", "add_offset"
 _MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 # What tifffile itself writes, and what is read of the one file alone. Anything else of its kinds is read as plain
 # pages; asking the library for its list leaves out no kind that it may learn.
@@ -62,11 +68,13 @@ class TiffFormat:
         wavelengths, units = named_wavelengths(file)
         axes, about_axes = _axes(path, series, None if wavelengths is None else len(wavelengths))
         array = _values(path, file, series)
+        declared = declared_of(path.name, _said(file, array.shape[axes[2]] if len(axes) == 3 else 1))
         if len(axes) == 2:
             array, axes = array[..., None], (*axes, 2)
         return describe(
             path, self.name, ArrayPixels(array.transpose(axes)),
-            wavelengths=wavelengths, units=units, warnings=packing + _about_others(file, series) + about_axes,
+            wavelengths=wavelengths, units=units, declared=declared,
+            warnings=packing + _about_others(file, series) + about_axes,
         )  # fmt: skip
 
 
@@ -174,3 +182,23 @@ def _values(path: Path, file: tifffile.TiffFile, series: tifffile.TiffPageSeries
     out = scratch_array(tuple(series.shape), series.dtype)
     series.asarray(out=out)
     return out
+
+
+def _said(file: tifffile.TiffFile, bands: int) -> dict[str, object]:
+    """What GDAL's tags and the JSON description that tifffile writes say of the values."""
+    said: dict[str, object] = {}
+    for described in file.shaped_metadata or ():
+        said |= {name: value for name, value in described.items() if plain(name) in WORDS}
+    tags = file.pages.first.tags
+    if _GDAL_NODATA in tags:
+        said["nodata"] = str(tags[_GDAL_NODATA].value)
+    if _GDAL_METADATA in tags:
+        text = str(tags[_GDAL_METADATA].value)
+        for role, name, usual in (("scale", _GAINS, "1"), ("offset", _OFFSETS, "0")):
+            numbers = [usual] * bands
+            for found in _GDAL_ITEM.finditer(text):
+                sample = int(found[1])
+                if f'role="{role}"' in found[0] and sample < bands:
+                    numbers[sample] = found[2]
+            said[name] = " ".join(numbers)
+    return said

@@ -108,7 +108,7 @@ def coverage_blocks(material: Material) -> Iterator[Block]:
     yield Picture(
         lambda: result_figures.draw_flags(cloud, material.frame),
         "map",
-        "Map of the cube with the points that are flagged as grazing, interpolated, saturated or occluded.",
+        "Map of the cube with the points that are flagged as grazing, interpolated, saturated, empty or occluded.",
         "Flagged points, the gravest reason of each pixel, in the cube as it was recorded; shares of the specimen's "
         "points. Leave flagged points out where places or spectra must be certain.",
     )

@@ -25,6 +25,7 @@ KINDS = (
     (Flag.GRAZING, "grazing, over 70 degrees", p.ORANGE),
     (Flag.DEPTH_INTERPOLATED, "depth interpolated", p.BLUE),
     (Flag.SATURATED, "spectrum saturated", p.PURPLE),
+    (Flag.NO_DATA, "no value in some band", p.BLACK),
     (Flag.OCCLUDED, "occluded", p.VERMILION),
 )
 """Flags that make a point doubtful, the gravest last; names for the legend."""

@@ -20,9 +20,9 @@ _CELLS_TOGETHER = 65536
 def write_envi(cloud: Cloud, target: Path, *, grid_mm: float) -> Path:
     """Write ``<name>.hdr`` and ``<name>.bil`` (BIL, uint16) for a ``target`` of that name; the header's path.
 
-    A cell's spectrum is the mean over its points at most 1 mm below the highest. A cell without points is 0, the
-    data ignore value. Values are the cloud's stored ones: reflectance * 10000 (``reflectance scale factor``), or
-    counts with gains and offsets where they were scaled.
+    A cell's spectrum is the mean over its points at most 1 mm below the highest, where they have a value. A cell
+    without one is the data ignore value: 0, or the cloud's own value for none. Values are the cloud's stored ones:
+    reflectance * 10000 (``reflectance scale factor``), or what gains and offsets decode.
 
     The grid is the marker frame's: cell (0, 0)'s centre at (x_min, y_min). ENVI's lines run downward and its
     y upward: the first line is the one of largest y, and ``map info`` ties the last line's first pixel, cell
@@ -52,7 +52,7 @@ def _lines_downward(cloud: Cloud, view: TopView) -> Iterator[NDArray[np.uint16]]
         fitting = np.searchsorted(first_of_row, first_of_row[stop] - _POINTS_TOGETHER)
         start = min(stop - 1, max(int(fitting), stop - _CELLS_TOGETHER // view.cols, 0))
         part = slice(first_of_row[start], first_of_row[stop])
-        means = np.zeros(((stop - start) * view.cols, cloud.bands), np.uint16)
+        means = np.full(((stop - start) * view.cols, cloud.bands), cloud.fill_value or 0, np.uint16)
         inside, where = points[part], cells[part] - start * view.cols
         # One row of a fine cloud may hold more points than fit: cells are averaged in portions of whole cells.
         for a, b in _portions(where):
@@ -83,7 +83,13 @@ def _average(cloud: Cloud, points: NDArray[np.intp], cells: NDArray[np.int32], m
     means[cells[alone]] = spectra[alone]
     several = counts > 1
     for first, count in zip(firsts[several].tolist(), counts[several].tolist(), strict=True):
-        means[cells[first]] = np.rint(spectra[first : first + count].mean(0, dtype=np.float32))
+        part = spectra[first : first + count]
+        if cloud.fill_value is None:
+            means[cells[first]] = np.rint(part.mean(0, dtype=np.float32))
+            continue
+        known = part != cloud.fill_value
+        mean = np.where(known, part, 0).sum(0, dtype=np.float32) / np.maximum(known.sum(0), 1)
+        means[cells[first]] = np.where(known.any(0), np.rint(mean), cloud.fill_value)
 
 
 def _header(cloud: Cloud, view: TopView) -> str:
@@ -100,7 +106,7 @@ def _header(cloud: Cloud, view: TopView) -> str:
         "data type": 12,
         "interleave": "bil",
         "byte order": 0,
-        "data ignore value": 0,
+        "data ignore value": cloud.fill_value or 0,
         # Reference pixel: 1-based, its centre at a half. It is cell (0, 0), in the last line.
         "map info": f"{{Arbitrary, 1.5, {view.rows + 0.5:.1f}, {view.x_min:.6f}, {view.y_min:.6f}, "
         f"{view.grid_mm:g}, {view.grid_mm:g}, units=Millimeters}}",
@@ -108,7 +114,7 @@ def _header(cloud: Cloud, view: TopView) -> str:
     }
     if np.isfinite(cloud.wavelengths_nm).all():
         fields |= {"wavelength units": "Nanometers", "wavelength": listed(cloud.wavelengths_nm)}
-    if cloud.quantity == "reflectance":
+    if cloud.quantity == "reflectance" and cloud.add_offset == 0:
         fields["reflectance scale factor"] = f"{1 / cloud.scale_factor:g}"
     elif cloud.scale_factor != 1 or cloud.add_offset != 0:
         fields["data gain values"] = listed(np.full(cloud.bands, cloud.scale_factor))

@@ -18,8 +18,8 @@ _BLOCK = 16384
 def write_npz(cloud: Cloud, target: Path) -> Path:
     """Write all arrays under their names in the cloud, ``spectra`` as stored (S, B) uint16.
 
-    ``scale_factor`` and ``add_offset`` decode the spectra into ``quantity``; ``attributes`` is the group's
-    attributes as a JSON text.
+    ``scale_factor`` and ``add_offset`` decode the spectra into ``quantity``; ``fill_value``, where it is there, is
+    stored where there is no value. ``attributes`` is the group's attributes as a JSON text.
     """
     small: dict[str, Array] = {
         "xyz": cloud.xyz,
@@ -35,6 +35,8 @@ def write_npz(cloud: Cloud, target: Path) -> Path:
         "quantity": np.array(cloud.quantity),
         "attributes": np.array(json.dumps(cloud.attributes)),
     }
+    if cloud.fill_value is not None:
+        small["fill_value"] = np.array(cloud.fill_value, np.uint16)
     with atomic_path(target) as aside, zipfile.ZipFile(aside, "w", zipfile.ZIP_STORED) as archive:
         for name, values in small.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:

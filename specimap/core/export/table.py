@@ -22,7 +22,8 @@ _LINE = "%.4f,%.4f,%.4f,%.4f,%.4f,%.4f,%d,%d,%d,%.4f,%d,%d,%d"
 def write_csv(cloud: Cloud, target: Path) -> Path:
     """Write a header and one line for each point; spectra are decoded (reflectance, or counts).
 
-    A spectral column is headed by its wavelength in nm, or by ``band_<index>`` where that is unknown.
+    What has no value is ``nan``. A spectral column is headed by its wavelength in nm, or by ``band_<index>`` where that
+    is unknown.
     """
     known = np.isfinite(cloud.wavelengths_nm).all() and len(set(_names(cloud))) == cloud.bands
     bands = _names(cloud) if known else [f"band_{i}" for i in range(cloud.bands)]
@@ -49,9 +50,11 @@ def _texts(cloud: Cloud) -> NDArray[np.bytes_]:
     """What each stored value reads as, with the comma before it: formatting 65536 values once is enough."""
     stored = np.arange(LARGEST + 1)
     values = (stored * cloud.scale_factor + cloud.add_offset).tolist()
-    if cloud.quantity == "reflectance":
-        return np.array([f",{value:.4f}" for value in values], "S")
-    return np.array([f",{value:.9g}" for value in values], "S")
+    form = ".4f" if cloud.quantity == "reflectance" else ".9g"
+    texts = [f",{value:{form}}" for value in values]
+    if cloud.fill_value is not None:
+        texts[cloud.fill_value] = ",nan"
+    return np.array(texts, "S")
 
 
 def _rows(cloud: Cloud, part: slice) -> zip[tuple[float, ...]]:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from specimap.core.cube import FORMATS, Cube, inspect, open_cube
 from specimap.core.cube.envi_header import EnviHeader, is_envi_header, read_header
-from specimap.core.cube.model import sampled_rows
 from specimap.core.cube.npy import starts_with
+from specimap.core.cube.pixels import sampled_rows
 from specimap.core.cube.wavelengths import Warnings, bad_band_mask, nanometres
 from specimap.core.errors import CubeFormatError, CubeHeaderError, SpecimapError, StorageFullError
 from specimap.core.geometry import Floats

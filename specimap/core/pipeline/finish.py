@@ -15,6 +15,7 @@ from specimap.core.accuracy import CornersInCube, camera_figures, homography_fig
 from specimap.core.adjust import Adjusted, triangulate
 from specimap.core.cloud import Cloud, CloudPoints, Flag
 from specimap.core.cloud.writer import write_cloud
+from specimap.core.cloud.written import Written
 from specimap.core.cube import Cube
 from specimap.core.files import write_text
 from specimap.core.geometry import Floats, Pose, View
@@ -80,13 +81,16 @@ def register_and_write(
             write_mesh_ply(aside.mesh, mesh)
             named = zip(adjusted.marker_ids, adjusted.corners, strict=True)
             write_text(aside.corners, json.dumps({str(i): np.round(c, 6).tolist() for i, c in named}, indent=1))
+
+            def attributes(written: Written) -> dict[str, object]:
+                nonlocal report
+                found = [Remark(code=c, message=m) for c, m in written.remarks()]
+                report = report.model_copy(update={"warnings": [*report.warnings, *found]})
+                return {"report": report.summary(), "settings": settings.as_dict(), "inputs": inputs}
+
             write_cloud(
-                aside.cloud,
-                points,
-                cube,
-                {"report": report.summary(), "settings": settings.as_dict(), "inputs": inputs},
-                progress=lambda share: progress(0.4 + 0.5 * share),
-            )
+                aside.cloud, points, cube, attributes, progress=lambda share: progress(0.4 + 0.5 * share)
+            )  # fmt: skip
             write_preview(Cloud.open(aside.cloud), aside.preview)
             if stage1.sheet:
                 aside.sheet.write_bytes(stage1.sheet)

@@ -17,6 +17,11 @@ from specimap.core.geometry import Array, Floats
 LEAST_MARKERS = 2
 WINDOWS = 6
 """Parts of the spectrum that are tried, and single bands within them, where the mean does not show markers."""
+ABSURD_SPANS = 3.0
+"""What lies so many spans of the usual values beyond them is a dead pixel."""
+WIDE_HOLE_PX = 7
+"""Holes from this width on are no dead columns: nothing was recorded there."""
+_AROUND = np.array([[0.5, 1, 0.5], [1, 0, 1], [0.5, 1, 0.5]], np.float32)
 
 
 class Bands(Protocol):
@@ -56,7 +61,8 @@ class CubeMarkers:
     """Corners of the known markers in the cube.
 
     ``corners_px`` (Q, 4, 2) x (column), y (row) of ``marker_ids``; ``sigma_px`` (Q,); ``image`` (rows, cols) in
-    which they were found; ``where``: in words; ``mirrored``: the cube's columns run the wrong way round, corners
+    which they were found, as :func:`cleaned` gives it;
+    ``where``: in words; ``mirrored``: the cube's columns run the wrong way round, corners
     are given in its own columns all the same.
     """
 
@@ -68,13 +74,46 @@ class CubeMarkers:
     mirrored: bool
 
 
+def cleaned(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A linear image (rows, cols) without dead pixels and columns; where a larger part has no value it stays NaN.
+
+    Values far outside of all others count as none; holes up to six pixels wide take on what surrounds them.
+    """
+    image = np.where(np.isfinite(image), image, np.nan).astype(np.float32)
+    if not np.isfinite(image).any():
+        return image
+    low, high = _stretch(image)
+    reach = ABSURD_SPANS * (high - low)
+    image[(image > high + reach) | (image < low - reach)] = np.nan
+    holes = np.isnan(image)
+    if not holes.any():
+        return image
+    square = np.ones((WIDE_HOLE_PX, WIDE_HOLE_PX), np.uint8)
+    large = cv2.morphologyEx(holes.astype(np.uint8), cv2.MORPH_OPEN, square) > 0
+    for _ in range(WIDE_HOLE_PX // 2):
+        known = np.isfinite(image)
+        weight = cv2.filter2D(known.astype(np.float32), -1, _AROUND, borderType=cv2.BORDER_CONSTANT)
+        total = cv2.filter2D(np.where(known, image, np.float32(0)), -1, _AROUND, borderType=cv2.BORDER_CONSTANT)
+        reached = ~known & ~large & (weight > 0)
+        image[reached] = total[reached] / weight[reached]
+    return image
+
+
+def _stretch(image: NDArray[np.float32]) -> tuple[float, float]:
+    """The 0.5th and 99.5th percentile of the finite values."""
+    finite = image[np.isfinite(image)]
+    low, high = np.percentile(finite[:: max(1, finite.size // 200_000)].astype(np.float64), [0.5, 99.5])
+    return float(low), float(high)
+
+
 def stretched(image: NDArray[np.float32]) -> NDArray[np.uint8]:
     """0.5-99.5 % of the finite values to bytes, encoded as sRGB would, which detection expects."""
-    finite = image[np.isfinite(image)]
-    if not finite.size:
+    if not np.isfinite(image).any():
         return np.zeros(image.shape, np.uint8)
-    low, high = np.percentile(finite[:: max(1, finite.size // 200_000)], [0.5, 99.5])
-    scaled = np.clip((np.nan_to_num(image, nan=low) - low) / max(high - low, 1e-12), 0, 1)
+    low, high = _stretch(image)
+    # Wide: differences of float32 at the ends of their range do not fit float32.
+    wide = np.nan_to_num(image.astype(np.float64), nan=low, posinf=high, neginf=low)
+    scaled = np.clip((wide - low) / max(high - low, 1e-12), 0, 1)
     return np.asarray(255 * np.sqrt(scaled), np.uint8)
 
 
@@ -105,7 +144,8 @@ def find_markers(cube: Bands, dictionary: str, known: tuple[int, ...]) -> CubeMa
     mean = cube.mean_image()
     best: tuple[list[Detection], NDArray[np.float32], str, bool] = ([], mean, "band mean", False)
     enough = min(len(known), 4)
-    for image, where in _candidates(cube, mean):
+    for raw, where in _candidates(cube, mean):
+        image = cleaned(raw)
         for mirrored in (False, True):
             seen = image[:, ::-1] if mirrored else image
             found = find_in_image(np.ascontiguousarray(seen), dictionary, known)
