@@ -120,7 +120,7 @@ WAYS = [
 Way = Callable[[h5py.File, str, tuple[int, ...], Path], None]
 ROLES: dict[str, tuple[int, ...]] = {
     "cube": SHAPE, "L1/reflectance": SHAPE, "wavelengths": (11,), "scan/wavelength_nm": (11,), "bbl": (11,),
-    "anything/else": (4,),
+    "anything/else": (4,), "scale_factor": (1,), "nodata": (1,),
 }  # fmt: skip
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from specimap.core.cube.declared import WORDS, plain
 from specimap.core.cube.model import readable_dtype
 from specimap.core.cube.shown import shown
 from specimap.core.cube.spectral_units import read_unit
@@ -151,16 +150,6 @@ def _refusal(path: Path, what: str, variables: Sequence[Variable]) -> CubeFormat
     )
 
 
-def declaring(variables: Sequence[Variable], cube: Variable) -> list[Variable]:
-    """The small variables beside the cube whose names declare what its values mean (see ``declared``)."""
-    folder = cube.name.rpartition("/")[0]
-    return [
-        v for v in variables
-        if plain(v.short_name) in WORDS and v.name.rpartition("/")[0] == folder
-        and math.prod(v.shape) in (1, *cube.shape) and readable_dtype(v.dtype)
-    ]  # fmt: skip
-
-
 def choose_wavelengths(variables: Sequence[Variable], cube: Variable) -> Variable | None:
     """The vector whose name speaks of wavelengths; one as long as an axis of the cube, and near it, comes first.
 
@@ -180,6 +169,16 @@ def choose_wavelengths(variables: Sequence[Variable], cube: Variable) -> Variabl
     ]  # fmt: skip
     nearest = max(told, key=lambda v: _groups_shared(v, best), default=None)
     return replace(best, units=nearest.text if nearest else _units_in_name(best.short_name))
+
+
+def arrays_beside(variables: Sequence[Variable], cube: Variable) -> list[Variable]:
+    """Numbers and vectors of the cube's own group: one number, or one for each of its rows, columns or bands."""
+    return [
+        v
+        for v in variables
+        if _group(v) == _group(cube) and v.text is None and readable_dtype(v.dtype)
+        and math.prod(v.shape) in (1, *cube.shape)
+    ]  # fmt: skip
 
 
 def _spectral_vectors(variables: Sequence[Variable]) -> list[Variable]:

@@ -49,7 +49,7 @@ class HdfFormat:
                 wavelengths, values = _wavelengths(path, file, variables, cube)
                 reversed_axes = "MATLAB_class" in node.attrs
                 axes, warnings = cube_axes(cube, wavelengths, reversed_axes=reversed_axes)
-                declared = _declared(path, file, cube)
+                declared = _declared(path, file, node)
                 pixels = _pixels(path, node, axes)
         except OSError as error:
             sizes = _TRUNCATED.search(str(error))
@@ -157,18 +157,18 @@ def _text(value: object) -> str | None:
     return value if isinstance(value, str) else None
 
 
-def _declared(path: Path, file: h5py.File, cube: Variable) -> Declared:
+def _declared(path: Path, file: h5py.File, dataset: h5py.Dataset) -> Declared:
     """What the cube's own attributes say of its values, and small data sets beside it (MATLAB keeps them so)."""
-    dataset = file[cube.name]
     said: dict[str, object] = {}
-    for name in dataset.parent:
-        if plain(name) in WORDS and isinstance(dataset.parent.get(name, getlink=True), h5py.HardLink):
-            node = dataset.parent[name]
+    group = dataset.parent
+    for name in group:
+        if plain(name) in WORDS and isinstance(group.get(name, getlink=True), h5py.HardLink):
+            node = group[name]
             if isinstance(node, h5py.Dataset) and node.shape is not None and node.size in (1, *dataset.shape):
                 said[name] = guarded_dataset(path, file, node.name)[()]
     said |= {name: value for name, value in _attributes(dataset) if plain(name) in (*WORDS, "unsigned")}
     titles = (_text(value) for name, value in _attributes(dataset) if name in ("long_name", "standard_name"))
-    return declared_of(path.name, said, cube.name, *titles)
+    return declared_of(path.name, said, str(dataset.name), *titles)
 
 
 def _pixels(path: Path, dataset: h5py.Dataset, axes: tuple[int, int, int]) -> Pixels:

@@ -14,8 +14,8 @@ from typing import BinaryIO
 
 import numpy as np
 
-from specimap.core.cube.declared import declared_of
-from specimap.core.cube.discover import choose_cube, choose_wavelengths, cube_axes, declaring
+from specimap.core.cube.declared import WORDS, declared_of, plain
+from specimap.core.cube.discover import arrays_beside, choose_cube, choose_wavelengths, cube_axes
 from specimap.core.cube.matlab5_elements import (
     COMPRESSED,
     HEADER_BYTES,
@@ -53,7 +53,8 @@ class Matlab5Format:
             wavelengths = choose_wavelengths(variables, cube)
             array = _values(path, file, found[cube.name])
             values = None if wavelengths is None else _values(path, file, found[wavelengths.name])
-            said = {v.short_name: _values(path, file, found[v.name]) for v in declaring(variables, cube)}
+            small = [v for v in arrays_beside(variables, cube) if plain(v.short_name) in WORDS]
+            said = {v.short_name: _values(path, file, found[v.name]) for v in small}
         axes, about_axes = cube_axes(cube, wavelengths, reversed_axes=False)
         return describe(
             path,
