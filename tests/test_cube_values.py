@@ -130,9 +130,9 @@ def test_words_for_no_no_data_value(tmp_path: Path, word: str) -> None:
 @pytest.mark.parametrize("form", ["one", "each", "gain", "offset"])
 def test_gains_and_offsets_give_reflectance_to_the_last_digit(tmp_path: Path, name: str, form: str) -> None:
     right = truth()
-    gains = np.linspace(0.5e-4, 1.5e-4, 6) if form == "each" else np.array([0.5e-4])
+    gains: Floats | None = np.linspace(0.5e-4, 1.5e-4, 6) if form == "each" else np.array([0.5e-4])
     offsets = np.linspace(-0.05, 0.05, 6) if form == "each" else np.array([-0.0123])
-    if form == "offset":
+    if form == "offset" or gains is None:
         gains, stored = None, (right - offsets).astype("f4")
     else:
         stored = np.rint((right - (0 if form == "gain" else offsets)) / gains).astype("i2")
@@ -188,7 +188,8 @@ def test_idle_gains_leave_counts_alone(tmp_path: Path) -> None:
         tmp_path / "x.hdr", stored, data_gain_values=listed(np.ones(11)), data_offset_values=listed(np.zeros(11))
     )
     cube = open_cube(path)
-    assert (cube.dtype, cube.quantity) == (np.uint16, "counts")
+    assert cube.dtype == np.uint16
+    assert cube.quantity == "counts"
     np.testing.assert_array_equal(cube.read_rows(0, 7), stored)
 
 
@@ -230,8 +231,8 @@ def test_negative_reflectance_is_kept(tmp_path: Path, low: float, dtype: str) ->
     right = truth()
     right[2:5, 3:6] = low
     stored = np.rint(right * 1e4).astype("i2") if dtype == "i2" else right.astype("f4")
-    extra = {"reflectance_scale_factor": 10000}
-    cube = open_cube(write_envi(tmp_path / "x.hdr", stored * np.array(1 if dtype == "i2" else 1e4, dtype), **extra))
+    stored = stored * np.array(1 if dtype == "i2" else 1e4, dtype)
+    cube = open_cube(write_envi(tmp_path / "x.hdr", stored, reflectance_scale_factor=10000))
     image, flags, cloud = as_image(cube, tmp_path)
     np.testing.assert_allclose(image, right, rtol=0, atol=1e-6)
     assert cloud.add_offset == low
