@@ -12,7 +12,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from specimap.core.cube.declared import WORDS, Declared, declared_of, plain
+from specimap.core.cube.declared import WORDS, Declared, declared_of, is_word, plain
 from specimap.core.cube.discover import Variable, choose_cube, choose_wavelengths, cube_axes
 from specimap.core.cube.model import Cube, describe
 from specimap.core.cube.pixels import ArrayPixels, Pixels
@@ -107,7 +107,7 @@ def _declared(path: Path, file: h5py.File, cube: Variable) -> Declared:
         # Links may lead out of the file: only what stands in it is looked at.
         if plain(name) in WORDS and isinstance(dataset.parent.get(name, getlink=True), h5py.HardLink):
             node = dataset.parent[name]
-            if _is_own(node) and node.size in (1, *dataset.shape):
+            if _is_own(node) and is_word(name, node.shape):
                 said[name] = node[()]
     said |= {name: value for name, value in dataset.attrs.items() if plain(name) in (*WORDS, "unsigned")}
     titles = (_text(dataset.attrs.get(title)) for title in ("long_name", "standard_name"))

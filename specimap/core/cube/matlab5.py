@@ -17,7 +17,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from specimap.core.cube.declared import WORDS, declared_of, plain
+from specimap.core.cube.declared import declared_of, is_word
 from specimap.core.cube.discover import Variable, choose_cube, choose_wavelengths, cube_axes
 from specimap.core.cube.model import Cube, describe
 from specimap.core.cube.npy import starts_with
@@ -67,8 +67,7 @@ class Matlab5Format:
             wavelengths = choose_wavelengths(variables, cube)
             array = _values(path, file, found[cube.name])
             values = None if wavelengths is None else _values(path, file, found[wavelengths.name])
-            small = [v for v in variables if plain(v.name) in WORDS and math.prod(v.shape) in (1, *cube.shape)]
-            said = {v.name: _values(path, file, found[v.name]) for v in small}
+            said = {v.name: _values(path, file, found[v.name]) for v in variables if is_word(v.name, v.shape)}
         axes, warnings = cube_axes(cube, wavelengths, reversed_axes=False)
         return describe(
             path,

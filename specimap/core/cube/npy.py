@@ -10,7 +10,7 @@ from typing import IO
 
 import numpy as np
 
-from specimap.core.cube.declared import WORDS, declared_of, plain
+from specimap.core.cube.declared import declared_of, is_word
 from specimap.core.cube.discover import Variable, choose_cube, choose_wavelengths
 from specimap.core.cube.model import Cube, check_dtype, describe, readable_dtype
 from specimap.core.cube.pixels import ArrayPixels
@@ -115,8 +115,8 @@ class NpzFormat:
             if wavelengths is not None:
                 values = np.array(_member(path, archive, wavelengths.name, headers), np.float64).ravel()
             array = _member(path, archive, cube.name, headers)
-            small = [v for v in variables if plain(v.name) in WORDS and math.prod(v.shape) in (1, *cube.shape)]
-            said = {v.name: _member(path, archive, v.name, headers) for v in small if readable_dtype(v.dtype)}
+            small = [v.name for v in variables if is_word(v.name, v.shape) and readable_dtype(v.dtype)]
+            said = {name: _member(path, archive, name, headers) for name in small}
         return describe(
             path,
             self.name,
