@@ -90,7 +90,7 @@ def test_the_same_result_however_values_are_stored(
     want = np.where(missing, np.nan, right)[placed]
     np.testing.assert_allclose(spectra[inner][placed], want, rtol=0, atol=0.51e-4 if name == "gains" else 1e-6)
     lacks: Array = np.greater(flags & np.uint8(Flag.NO_DATA), 0)
-    assert (lacks[inner][placed] == missing.any(-1)[placed]).all()
+    assert (lacks[inner][placed] == np.asarray(missing.any(-1))[placed]).all()
     assert (flags & Flag.SATURATED == 0).all()
     outside = np.ones(shape, bool)
     outside[inner] = False
