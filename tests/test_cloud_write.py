@@ -178,6 +178,17 @@ def test_saturation(tmp_path: Path) -> None:
     assert marked == [{(2, 3)}, {(2, 3), (6, 7)}]
 
 
+def test_spectra_of_zeros_are_flagged(tmp_path: Path) -> None:
+    values = np.maximum(counts(20, 20, 6), 1)
+    values[3, 4] = 0
+    values[5, 6] = [0, 0, 0, 0, 0, 9]
+    values[7, 8] = [0, 0, 9, 0, 0, 0]  # a bad band
+    cube = FakeCube(values, bad=(2,))
+    written = write_cloud(tmp_path / "c.zarr", scene(20, 20, share=1), cube, {})
+    assert flagged(Cloud.open(tmp_path / "c.zarr"), Flag.NO_DATA) == {(3, 4), (7, 8)}
+    assert written.no_data == 2
+
+
 # ---- all or nothing -------------------------------------------------------------------------------------
 
 

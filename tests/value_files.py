@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -21,7 +22,7 @@ def listed(numbers: Floats) -> str:
 
 
 def envi(folder: Path, stored: Values, no_data: float | None, gains: Floats | None, offsets: Floats | None) -> Path:
-    said: dict[str, object] = {"wavelength": listed(NM), "wavelength_units": "nm"}
+    said: dict[str, Any] = {"wavelength": listed(NM), "wavelength_units": "nm"}
     if no_data is not None:
         said["data_ignore_value"] = f"{no_data:g}"
     if gains is not None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import datetime
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 from specimap_client._decode import Model
 
@@ -189,7 +190,15 @@ class Point(Model):
     labels: dict[str, Any]
     quantity: str
     wavelength_nm: tuple[float | None, ...]
-    spectrum: tuple[float | None, ...]
+    spectrum: tuple[float, ...]
+    """NaN where it has no value."""
+
+    @classmethod
+    def of(cls, data: object) -> Self:
+        """See :meth:`Model.of`."""
+        if isinstance(data, dict) and isinstance(data.get("spectrum"), list):
+            data = {**data, "spectrum": [math.nan if value is None else value for value in data["spectrum"]]}
+        return super().of(data)
 
 
 @dataclass(frozen=True)

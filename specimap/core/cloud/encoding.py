@@ -17,6 +17,8 @@ from specimap.core.geometry import Array
 LARGEST = 65535
 # Blocks of this many spectra stay in the second-level cache between the passes over them.
 _BLOCK = 256
+# A spectrum of fewer bands may well be zero in all.
+_LEAST_BANDS = 3
 # Values so many ranges below or above what can be stored were not measured.
 _FAR_BELOW, _FAR_ABOVE = 0.5, 8.0
 
@@ -122,6 +124,7 @@ class Gatherer:
         level = source.saturation if saturation is None else np.asarray(saturation, np.float64)
         self._saturated = SaturationCheck(source, level)
         self._runs = band_runs(~np.asarray(source.bad_bands, bool))
+        self._good = np.flatnonzero(~np.asarray(source.bad_bands, bool))
         self._copies = source.dtype == np.uint16 and encoding.gain == 1 and encoding.bias == 0
         # float32 holds 24 bits: enough for reflectance and for 16-bit counts.
         narrow = source.dtype.itemsize <= 2 or source.dtype == np.float32
@@ -141,12 +144,21 @@ class Gatherer:
             np.take(values, rows, 0, out=picked, mode="clip")
             found = flags[start : start + _BLOCK]
             found[self._saturated(picked, rows)] |= np.uint8(Flag.SATURATED)
+            found[self._empty(picked)] |= np.uint8(Flag.NO_DATA)
             if not self._copies:
                 work = self._work[: len(rows)]
                 if not self._encoding.scale(picked, work):
                     self._settle(picked, work, found)
                 np.copyto(target, work, casting="unsafe")
         return flags
+
+    def _empty(self, picked: Array) -> NDArray[np.intp]:
+        """Which spectra are zero in all good bands: nothing was recorded there."""
+        if len(self._good) < _LEAST_BANDS:
+            return np.empty(0, np.intp)
+        # One band tells for nearly all of them.
+        suspects = np.flatnonzero(picked[:, self._good[len(self._good) // 2]] == 0)
+        return suspects[~picked[np.ix_(suspects, self._good)].any(1)]
 
     def _settle(self, picked: Array, work: Array, flags: NDArray[np.uint8]) -> None:
         """Bring into range what cannot be stored, and flag and count it where the band is good."""

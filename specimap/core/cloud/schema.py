@@ -35,7 +35,7 @@ class Flag(IntFlag):
     UNDERCUT = 64
     """Other tissue stands above this place: top views and grids do not show it; the spectrum is its own (camera)."""
     NO_DATA = 128
-    """A good band has no value: the file's no-data value, a dead detector element, or no finite number."""
+    """A good band has no value: no-data, a dead detector element, no finite number; or all of them are zero."""
 
 
 @dataclass(frozen=True, eq=False)

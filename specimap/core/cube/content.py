@@ -49,7 +49,7 @@ def inspect(cube: Cube, mean: NDArray[np.float32]) -> Warnings:
     zero_pixels = int((mean == 0).sum())
     if zero_pixels > _LEAST_ZERO_SHARE * mean.size:
         text = f"{zero_pixels} of {mean.size} pixels are zero in all good bands, as where nothing was recorded."
-        warnings.append(("pixels_zero", f"{text} The file names no no-data value that says so."))
+        warnings.append(("pixels_zero", f"{text} Their points are flagged (128)."))
     if sample.dtype.kind == "f":
         missing = np.isnan(sample[..., ~cube.bad_bands])
         partly = missing & ~missing.all(-1, keepdims=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ _UNSIGNED = "unsigned"
 WORDS = frozenset((*_NO_DATA, *_GAINS, *_OFFSETS, _DIVISOR, *_CEILING, _BITS, *_VALID))
 """What the names of attributes and variables are compared with, see :func:`plain`."""
 _NOTHING = ("", "none", "null", "na", "n/a")
+_LONGEST = 100_000
 _SEPARATORS = re.compile(r"[\s,{}\[\]()]+")
 
 
@@ -101,6 +103,12 @@ def declared_of(file_name: str, attributes: Mapping[str, object], *titles: str |
         names=names,
         warnings=warnings,
     )
+
+
+def is_word(name: str, shape: tuple[int, ...]) -> bool:
+    """Whether a small variable beside an array, by its name and shape, declares something of the array's values."""
+    size = math.prod(shape)
+    return plain(name) in WORDS and size == max(shape, default=1) and 0 < size <= _LONGEST
 
 
 def check_counts(file_name: str, declared: Declared, bands: int) -> None:

@@ -172,12 +172,10 @@ def choose_wavelengths(variables: Sequence[Variable], cube: Variable) -> Variabl
 
 
 def arrays_beside(variables: Sequence[Variable], cube: Variable) -> list[Variable]:
-    """Numbers and vectors of the cube's own group: one number, or one for each of its rows, columns or bands."""
+    """Arrays of numbers in the cube's own group, the cube aside."""
     return [
-        v
-        for v in variables
-        if _group(v) == _group(cube) and v.text is None and readable_dtype(v.dtype)
-        and math.prod(v.shape) in (1, *cube.shape)
+        v for v in variables
+        if _group(v) == _group(cube) and v.name != cube.name and v.text is None and readable_dtype(v.dtype)
     ]  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from specimap.core.cube.declared import WORDS, Declared, declared_of, plain
+from specimap.core.cube.declared import WORDS, Declared, declared_of, is_word, plain
 from specimap.core.cube.discover import Variable, choose_cube, choose_wavelengths, cube_axes
 from specimap.core.cube.hdf_guard import guarded_dataset, open_guarded
 from specimap.core.cube.model import Cube, describe
@@ -164,7 +164,7 @@ def _declared(path: Path, file: h5py.File, dataset: h5py.Dataset) -> Declared:
     for name in group:
         if plain(name) in WORDS and isinstance(group.get(name, getlink=True), h5py.HardLink):
             node = group[name]
-            if isinstance(node, h5py.Dataset) and node.shape is not None and node.size in (1, *dataset.shape):
+            if isinstance(node, h5py.Dataset) and node.shape is not None and is_word(name, node.shape):
                 said[name] = guarded_dataset(path, file, node.name)[()]
     said |= {name: value for name, value in _attributes(dataset) if plain(name) in (*WORDS, "unsigned")}
     titles = (_text(value) for name, value in _attributes(dataset) if name in ("long_name", "standard_name"))

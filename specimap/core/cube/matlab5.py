@@ -14,7 +14,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from specimap.core.cube.declared import WORDS, declared_of, plain
+from specimap.core.cube.declared import declared_of, is_word
 from specimap.core.cube.discover import arrays_beside, choose_cube, choose_wavelengths, cube_axes
 from specimap.core.cube.matlab5_elements import (
     COMPRESSED,
@@ -53,7 +53,7 @@ class Matlab5Format:
             wavelengths = choose_wavelengths(variables, cube)
             array = _values(path, file, found[cube.name])
             values = None if wavelengths is None else _values(path, file, found[wavelengths.name])
-            small = [v for v in arrays_beside(variables, cube) if plain(v.short_name) in WORDS]
+            small = [v for v in arrays_beside(variables, cube) if is_word(v.short_name, v.shape)]
             said = {v.short_name: _values(path, file, found[v.name]) for v in small}
         axes, about_axes = cube_axes(cube, wavelengths, reversed_axes=False)
         return describe(

@@ -34,9 +34,10 @@ class Missing:
     def mark(self, raw: Array, out: Array, dead: NDArray[np.bool_] | None) -> None:
         """Set ``out`` to NaN where the stored ``raw``, of the same shape, has no value."""
         whole = raw.dtype.kind in "iu"
-        for value in self.equal:
+        for given in self.equal:
+            value = float(raw.dtype.type(given))
             if whole or value == 0:
-                np.copyto(out, np.nan, where=raw == raw.dtype.type(value))
+                np.copyto(out, np.nan, where=raw == raw.dtype.type(given))
             else:
                 reach = abs(value) * _ROUNDING
                 np.copyto(out, np.nan, where=(raw >= value - reach) & (raw <= value + reach))

@@ -10,7 +10,7 @@ from typing import IO
 
 import numpy as np
 
-from specimap.core.cube.declared import WORDS, declared_of, plain
+from specimap.core.cube.declared import declared_of, is_word
 from specimap.core.cube.discover import Variable, arrays_beside, choose_cube, choose_wavelengths, cube_axes
 from specimap.core.cube.model import Cube, check_dtype, describe
 from specimap.core.cube.pixels import ArrayPixels
@@ -136,7 +136,7 @@ class NpzFormat:
             if wavelengths is not None:
                 values = np.array(_member(path, archive, wavelengths.name, headers), np.float64).ravel()
             array = _member(path, archive, cube.name, headers)
-            small = [v for v in arrays_beside(variables, cube) if plain(v.short_name) in WORDS]
+            small = [v for v in arrays_beside(variables, cube) if is_word(v.short_name, v.shape)]
             said = {v.short_name: _member(path, archive, v.name, headers) for v in small}
         axes, about_axes = cube_axes(cube, wavelengths, reversed_axes=False)
         if values is None:  # an archive follows .npy: rows x columns x bands, where nothing speaks against it

@@ -103,8 +103,9 @@ def _thinned(values: Array, *, by_pixel: bool = False) -> Array:
 def _missing(raw: Array, dtype: np.dtype, declared: Declared) -> tuple[Missing, Array, Warnings]:
     """Which stored values stand for none, the sample without them (dead elements still in it), and warnings."""
     warnings: Warnings = ()
-    possible = tuple(value for value in declared.no_data if _holds(dtype, value))
-    impossible = [f"{value:g}" for value in declared.no_data if value not in possible]
+    finite = [value for value in declared.no_data if np.isfinite(value)]
+    possible = tuple(value for value in finite if _holds(dtype, value))
+    impossible = [f"{value:g}" for value in finite if value not in possible]
     if impossible:
         text = f"The file's no-data value {', '.join(impossible)} is none that {dtype} can hold: nothing is left out."
         warnings = (("no_data_impossible", text),)
@@ -144,9 +145,9 @@ def _largest(values: Array) -> float:
 def _holds(dtype: np.dtype, value: float) -> bool:
     """Whether a value of this type can be ``value``."""
     if dtype.kind == "f":
-        return bool(abs(value) <= float(np.finfo(dtype).max) * (1 + 1e-6)) or bool(np.isinf(value))
+        return bool(np.isfinite(dtype.type(value)))
     info = np.iinfo(dtype)
-    return bool(np.isfinite(value)) and value == int(value) and info.min <= value <= info.max
+    return value == int(value) and info.min <= value <= info.max
 
 
 def _without(raw: Array, missing: Missing) -> Array:

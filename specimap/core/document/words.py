@@ -28,7 +28,7 @@ REMARKS = {
     "values_nan": "Leave these values out of any analysis.",
     "points_no_data": "Leave points with the flag 128 out of any analysis, or the bands in which they lack a value.",
     "values_clipped": "Nothing, if these are glints or dead pixels; else check scale and offset in the cube's file.",
-    "pixels_zero": "If these pixels were not recorded, export the cube again with a no-data value in its header.",
+    "pixels_zero": "Leave these pixels out of any analysis; name zero as no-data value when exporting the cube.",
     "no_data_impossible": "Correct the no-data value in the cube's file; check whether another value stands for none.",
     "no_data_undeclared": "Export the cube again with its no-data value in the header.",
     "values_absurd": "Have dead pixels corrected in the camera's software; their points are flagged.",

@@ -115,7 +115,7 @@ def _header(cloud: Cloud, view: TopView) -> str:
     if np.isfinite(cloud.wavelengths_nm).all():
         fields |= {"wavelength units": "Nanometers", "wavelength": listed(cloud.wavelengths_nm)}
     if cloud.quantity == "reflectance" and cloud.add_offset == 0:
-        fields["reflectance scale factor"] = f"{1 / cloud.scale_factor:g}"
+        fields["reflectance scale factor"] = f"{1 / cloud.scale_factor:.10g}"
     elif cloud.scale_factor != 1 or cloud.add_offset != 0:
         fields["data gain values"] = listed(np.full(cloud.bands, cloud.scale_factor))
         fields["data offset values"] = listed(np.full(cloud.bands, cloud.add_offset))
