@@ -241,6 +241,20 @@ def test_a_child_process_is_confined_too_and_pipes_between_them_work(tmp_path: P
     assert done.stdout.split("\n")[:2] == ["heard True", "-9"], done.stderr
 
 
+def test_other_processes_stay_closed_where_proc_is_open(tmp_path: Path) -> None:
+    """As it is where a GPU's driver is asked through it."""
+    program = (
+        "import os\n"
+        "open('/proc/self/maps').read(1)\n"
+        "for name in ('environ', 'maps', 'mem', 'fd/0', 'root/etc/passwd', 'cwd/x'):\n"
+        "    try: open(f'/proc/{os.getppid()}/{name}')\n"
+        "    except PermissionError: print(name)\n"
+    )
+    command = confined([sys.executable, "-c", program], Reach(read=[Path("/proc")]), "require")
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.split() == ["environ", "maps", "mem", "fd/0", "root/etc/passwd", "cwd/x"]
+
+
 def test_no_rule_covers_a_private_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     beside = tmp_path / "modules"
     (beside / "data").mkdir(parents=True)
