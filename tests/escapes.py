@@ -132,6 +132,7 @@ def ways(told: dict[str, Any]) -> dict[str, Callable[[], object]]:
         "signal the parent": lambda: os.kill(parent, 0),
         "get hold of the parent": lambda: _called(LIBRARY.syscall(PIDFD_OPEN, parent, 0)),
         "limit the parent": lambda: _limited(parent),
+        "slow the parent down": lambda: os.setpriority(os.PRIO_PROCESS, parent, os.getpriority(os.PRIO_PROCESS, 0)),
         "connect by TCP": lambda: _connected(socket.AF_INET, stream, ("127.0.0.1", told["tcp"])),
         "send by UDP": lambda: _connected(socket.AF_INET, datagram, ("127.0.0.1", told["udp"])),
         "connect to a UNIX socket": lambda: _connected(socket.AF_UNIX, stream, told["unix"]),
@@ -149,6 +150,9 @@ def ways(told: dict[str, Any]) -> dict[str, Callable[[], object]]:
         "open a file to all": lambda: os.chmod(secret, 0o644),
         "change a file's time": lambda: os.utime(secret, (1, 1)),
         "change a file's owner": lambda: os.chown(secret, os.getuid(), os.getgid()),
+        "be another user": lambda: (os.seteuid(os.getuid() + 1), os.seteuid(os.getuid())),
+        "make a device": lambda: os.mknod(own / "zero", 0o600 | stat.S_IFCHR, os.makedev(1, 5)),
+        "share memory": lambda: _called(LIBRARY.shmget(0x5EC1, 4096, 0o1600)),
         "make a namespace": lambda: _called(LIBRARY.unshare(0x10000000)),
     }  # fmt: skip
 

@@ -61,9 +61,15 @@ print(json.dumps({"event": "done", "seconds": 0}), flush=True)
 """
 
 
+SECRET = (
+    "SPECIMAP_DATABASE_URL", "SPECIMAP_KEY", "AWS_SECRET_ACCESS_KEY", "PGPASSWORD", "DATABASE_URL", "S3_SECRET_KEY",
+    "POSTGRES_PASSWORD", "GITHUB_TOKEN", "google_application_credentials", "API_KEY", "SENTRY_DSN",
+)  # fmt: skip
+
+
 @pytest.fixture
 def all_set(bare: pytest.MonkeyPatch) -> None:
-    for name in (*BACKEND_VARIABLES, "SPECIMAP_DATABASE_URL", "SPECIMAP_KEY", "AWS_SECRET_ACCESS_KEY", "PGPASSWORD"):
+    for name in (*BACKEND_VARIABLES, *SECRET):
         bare.setenv(name, "value")
 
 
@@ -80,13 +86,14 @@ def test_a_stages_process_sees_the_variables_of_backends_and_no_secret(tmp_path:
     asyncio.run(run())
     seen = json.loads((tmp_path / "seen.json").read_text("utf-8"))
     assert {name for name in seen if name.startswith(("SPECIMAP_", "AWS_", "PG"))} == set(BACKEND_VARIABLES)
+    assert not set(SECRET) & set(seen)
     assert seen["PATH"] == os.environ["PATH"]
 
 
 @pytest.mark.usefixtures("all_set")
 def test_a_networks_process_sees_none_of_them(tmp_path: Path) -> None:
     for seen in (bare_environment(), child_environment(tmp_path, {})):
-        assert not [name for name in seen if name.startswith(("SPECIMAP_", "AWS_", "PG"))]
+        assert not [name for name in seen if name.startswith(("SPECIMAP_", "AWS_", "PG")) or name in SECRET]
         assert seen["PATH"] == os.environ["PATH"]
 
 

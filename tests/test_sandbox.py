@@ -177,8 +177,20 @@ def test_they_lead_out_where_nothing_is_confined(kind: str, told: dict[str, Any]
     moody = {
         "use io_uring", "trace the parent", "read the parent's memory", "open the parent's memory", "read a disk",
         "read /etc/shadow", "list the parent's open files", "make a namespace", "read it by the parent's root",
+        "be another user", "make a device",
     }  # fmt: skip
     assert {name: how for name, how in found.items() if how != "out" and name not in moody} == {}
+
+
+def test_no_capability_is_left(tmp_path: Path) -> None:
+    program = "print(*[line.split()[1] for line in open('/proc/self/status') if line.startswith(('Cap', 'NoNew'))])"
+    inner = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {program!r}], check=True)"
+    for code in (program, inner):
+        done = subprocess.run(
+            confined([sys.executable, "-c", code], Reach(write=[tmp_path], read=[Path("/proc")]), "require"),
+            capture_output=True, text=True, timeout=60, check=True,
+        )  # fmt: skip
+        assert done.stdout.split() == ["0" * 16] * 5 + ["1"]
 
 
 def test_a_cell_gives_the_inputs_to_read_alone(tmp_path: Path) -> None:
@@ -239,6 +251,20 @@ def test_a_child_process_is_confined_too_and_pipes_between_them_work(tmp_path: P
     command = confined(command, Reach(write=[tmp_path / "own"]), "require")
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.stdout.split("\n")[:2] == ["heard True", "-9"], done.stderr
+
+
+def test_other_processes_stay_closed_where_proc_is_open(tmp_path: Path) -> None:
+    """As it is where a GPU's driver is asked through it."""
+    program = (
+        "import os\n"
+        "open('/proc/self/maps').read(1)\n"
+        "for name in ('environ', 'maps', 'mem', 'fd/0', 'root/etc/passwd', 'cwd/x'):\n"
+        "    try: open(f'/proc/{os.getppid()}/{name}')\n"
+        "    except PermissionError: print(name)\n"
+    )
+    command = confined([sys.executable, "-c", program], Reach(read=[Path("/proc")]), "require")
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.split() == ["environ", "maps", "mem", "fd/0", "root/etc/passwd", "cwd/x"]
 
 
 def test_no_rule_covers_a_private_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import signal
 import struct
 import sys
 import zipfile
@@ -18,6 +20,7 @@ import pytest
 import tifffile
 from service_scene import Running, serving
 from upload_scene import new_acquisition, photos, send, sent
+from worker_scene import until
 
 from specimap.core.sandbox import protection
 from specimap.infra.settings import load_settings
@@ -295,6 +298,21 @@ def test_a_file_costs_its_own_copy_and_no_other_files_answer(tmp_path: Path) -> 
         # The same two children answered all of it.
         assert len({again["parent"], first["parent"]}) <= 2
         assert not list((tmp_path / "data" / "scratch" / "judging").iterdir())
+    finally:
+        judge.close()
+
+
+def test_a_copy_that_ends_while_it_waits_is_no_fault_of_the_next_file(tmp_path: Path) -> None:
+    judge = Judge(load_settings(data_dir=tmp_path / "data"), (sys.executable, "-c", POISON))
+    folder = tmp_path / "task"
+    folder.mkdir()
+    try:
+        child = judge.cube(folder / "good")["parent"]
+        children = Path(f"/proc/{child}/task/{child}/children")
+        (waiting,) = until(lambda: children.read_text().split(), 20, "the next copy")
+        os.kill(int(waiting), signal.SIGKILL)
+        for _ in range(4):  # each of the two children is asked
+            assert judge.cube(folder / "good")["verdict"] == "accepted"
     finally:
         judge.close()
 

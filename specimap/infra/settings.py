@@ -171,7 +171,8 @@ class ServiceSettings(BaseSettings):
         if not self.storage_place.startswith("s3://"):
             places.append(Path(self.storage_place))
         if self.database.startswith("sqlite:///"):
-            places.append(Path(self.database.removeprefix("sqlite:///")))
+            # With its journals, which come and go beside it.
+            places.append(Path(self.database.removeprefix("sqlite:///")).parent)
         if file := os.environ.get(CONFIG_VARIABLE):
             places.append(Path(file))
         return [place.absolute() for place in places]

@@ -87,8 +87,12 @@ class Copy:
         os.close(answer)
 
     def judge(self, line: str) -> bytes:
-        """Its answer to a task, one line each; :meth:`end` follows."""
-        with open(self._task, "wb", buffering=0) as pipe, suppress(BrokenPipeError):
+        """Its answer to a task, one line each; :meth:`end` follows.
+
+        Raises:
+            BrokenPipeError: it had ended before it saw the task.
+        """
+        with open(self._task, "wb", buffering=0) as pipe:
             pipe.write(line.encode())
         said = b""
         with open(self._answer, "rb", buffering=0) as pipe:
@@ -100,7 +104,8 @@ class Copy:
 
     def end(self) -> None:
         """End it. That takes as long as making it: the answer is sent before."""
-        os.kill(self.pid, signal.SIGKILL)
+        with suppress(ProcessLookupError):
+            os.kill(self.pid, signal.SIGKILL)
         os.waitpid(self.pid, 0)
 
 
@@ -159,7 +164,13 @@ def main() -> None:
     copy = Copy(memory, rules, mode)
     out.write(json_text({"ready": True}).encode() + b"\n")
     for line in sys.stdin:
-        out.write(copy.judge(line))
+        try:
+            said = copy.judge(line)
+        except BrokenPipeError:  # the system took its memory, say, while it waited: no fault of the file
+            copy.end()
+            copy = Copy(memory, rules, mode)
+            said = copy.judge(line)
+        out.write(said)
         copy.end()
         copy = Copy(memory, rules, mode)
 

@@ -16,7 +16,12 @@ MODES: tuple[str, ...] = get_args(Mode)
 Rule = tuple[str, int]
 """A place and Landlock's rights to it."""
 
-_LIBRARIES = ("/usr", "/lib", "/lib32", "/lib64", "/bin", "/sbin", "/nix/store", "/gnu/store")
+_SHARED = ("/usr", "/usr/local")
+_LIBRARIES = (
+    *(f"{prefix}/{name}" for prefix in _SHARED
+      for name in ("bin", "sbin", "lib", "lib32", "lib64", "libexec", "share", "include")),
+    "/lib", "/lib32", "/lib64", "/bin", "/sbin", "/nix/store", "/gnu/store",
+)  # fmt: skip
 _FILES = (
     "/etc/ld.so.cache", "/etc/ld.so.conf", "/etc/ld.so.conf.d", "/etc/localtime", "/etc/timezone", "/etc/passwd",
     "/etc/group", "/etc/nsswitch.conf", "/etc/hosts", "/etc/mime.types", "/etc/fonts", "/etc/alternatives",
@@ -87,8 +92,10 @@ def _without(place: Path, kept: Sequence[Path]) -> Iterator[Path]:
 
 
 def _of_interpreter() -> Iterator[Path]:
-    yield from (Path(place) for place in {sys.prefix, sys.exec_prefix, sys.base_prefix, sys.base_exec_prefix})
+    prefixes = {sys.prefix, sys.exec_prefix, sys.base_prefix, sys.base_exec_prefix}
+    yield from (Path(place) for place in prefixes if place not in _SHARED)
     yield from interpreter_places(sys.executable)
+    yield from Path("/usr/local").glob("cuda*")
     yield from (Path(place) for place in os.environ.get("LD_LIBRARY_PATH", "").split(":") if place)
 
 
@@ -120,4 +127,6 @@ def _gpu_devices() -> Iterator[Path]:
 def interpreter_places(python: str) -> Iterable[Path]:
     """What another interpreter is made of: its own environment and the one that this was made from."""
     for path in (os.path.abspath(python), os.path.realpath(python)):
-        yield Path(path).parent.parent
+        # One of the system's own lies among much else.
+        if str(place := Path(path).parent.parent) not in (*_SHARED, "/"):
+            yield place

@@ -36,6 +36,8 @@ _ALWAYS: dict[str, tuple[int | None, int | None]] = {
     "acct": (163, 89), "quotactl": (179, 60), "sethostname": (170, 161), "setdomainname": (171, 162),
     "settimeofday": (164, 170), "clock_settime": (227, 112), "adjtimex": (159, 171), "clock_adjtime": (305, 266),
     "iopl": (172, None), "ioperm": (173, None), "syslog": (103, 116), "vhangup": (153, 58),
+    "setpriority": (141, 140), "ioprio_set": (251, 30), "sched_setscheduler": (144, 119), "sched_setparam": (142, 118),
+    "sched_setattr": (314, 274), "quotactl_fd": (443, 443), "process_mrelease": (448, 448),
     "shmget": (29, 194), "shmat": (30, 196), "shmctl": (31, 195), "semget": (64, 190), "msgget": (68, 186),
     "mq_open": (240, 180), "mq_unlink": (241, 181),
     "chmod": (90, None), "fchmodat": (268, 53), "fchmodat2": (452, 452), "chown": (92, None), "lchown": (94, None),
@@ -46,7 +48,7 @@ _ALWAYS: dict[str, tuple[int | None, int | None]] = {
 _ALONE: dict[str, tuple[int | None, int | None]] = {
     "execve": (59, 221), "execveat": (322, 281), "fork": (57, None), "vfork": (58, None), "kill": (62, 129),
     "tkill": (200, 130), "setpgid": (109, 154), "setsid": (112, 157), "setrlimit": (160, 164),
-    "socketpair": (53, 199),
+    "socketpair": (53, 199), "sched_setaffinity": (203, 122),
 }  # fmt: skip
 _KILL, _TGKILL, _SENDTO, _SOCKETPAIR, _PRLIMIT, _CLONE, _CLONE3, _UTIMENSAT = (
     (62, 129), (234, 131), (44, 206), (53, 199), (302, 261), (56, 220), (435, 435), (280, 88),

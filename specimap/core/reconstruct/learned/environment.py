@@ -6,6 +6,7 @@ The service's settings and the process of a stage read it, so nothing heavy is i
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Collection, Mapping
 from dataclasses import asdict
 
@@ -22,15 +23,15 @@ BACKEND_VARIABLES: dict[str, str] = {
     DENSE_DEVICE: "Where the default backend measures depth: auto, cpu or gpu; auto takes a GPU where there is one.",
 }
 """Variable, and what it is."""
-SECRETS = ("SPECIMAP_", "AWS_", "PG")
-"""How the names of variables begin that may hold keys, or addresses of database and storage."""
+SECRETS = re.compile(r"^(SPECIMAP_|AWS_|PG)|SECRET|PASSW|TOKEN|CREDENTIAL|_KEY(_|$)|DATABASE_URL|_DSN$", re.IGNORECASE)
+"""Names of variables that may hold keys, or addresses of database and storage."""
 NOT_IN_IDENTITY = ("cache", "weights")
 """Fields that leave the result as it is: where scratch files lie, and the path of weights whose sha256 counts."""
 
 
 def bare_environment(keep: Collection[str] = ()) -> dict[str, str]:
     """The environment without :data:`SECRETS`, but for the variables to ``keep``."""
-    return {name: value for name, value in os.environ.items() if name in keep or not name.startswith(SECRETS)}
+    return {name: value for name, value in os.environ.items() if name in keep or not SECRETS.search(name)}
 
 
 def dense_device(environment: Mapping[str, str] = os.environ) -> str:
