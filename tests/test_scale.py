@@ -72,6 +72,11 @@ def test_grids_too_fine_or_too_coarse_for_the_layout(name: str, cell: float) -> 
     assert "mm" in refused.value.advice
 
 
+def test_a_single_marker_is_not_held_to_the_grids() -> None:
+    poses, corners = scene(1.0)
+    check_scale(poses, corners[:1], with_edge(6.8))
+
+
 def test_advice_on_an_edge_out_of_range_names_the_units() -> None:
     assert "30 if it is in metres" in advice_on("edge_mm", 0.03)
     assert "6.8 if it is in metres" in advice_on("edge_mm", 0.0068)

@@ -179,13 +179,18 @@ def _bytes_of(path: Path) -> bytes:
         size = path.stat().st_size
         if size > LARGEST_PHOTO_BYTES:
             raise _unusable(path, f"has {size / 1e9:.1f} GB, more than any photo")
-        return path.read_bytes()
+        data = path.read_bytes()
     except OSError as error:
         raise PhotoUnreadableError(
             f"{path.name} cannot be read ({error.strerror or error}).",
             advice="Let the account that runs Specimap read the photo.",
             photo=path.name,
         ) from error
+    if not data:
+        raise PhotoUnreadableError(
+            f"{path.name} is empty.", advice="Copy the photo from the phone again, or take it again.", photo=path.name
+        )
+    return data
 
 
 def _unusable(path: Path, why: str) -> PhotoUnreadableError:
