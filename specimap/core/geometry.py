@@ -32,8 +32,8 @@ def opencv_from_colmap(points_px: Floats) -> Floats:
 class Intrinsics:
     """A pinhole camera with two radial terms (OpenCV's k1, k2).
 
-    ``focal_px``, ``cx``, ``cy`` in pixels of an image of ``width`` x ``height``; centres at integers. ``aspect``: height
-    of a pixel over its width; ``focal_px`` counts widths.
+    ``focal_px``, ``cx``, ``cy`` in pixels of an image of ``width`` x ``height``; centres at integers. ``aspect``:
+    height of a pixel over its width; ``focal_px`` counts widths.
     """
 
     width: int

@@ -53,6 +53,9 @@ REMARKS = {
     "features_chosen": "Show two or more markers in every photo; poses from markers are the more exact ones.",
     "specimen_moved": "Do not rely on places: photograph and record again, and touch nothing in between.",
     "cube_camera_loose": "Show all four markers in the cube, sharper if you can, or tilt the camera a little.",
+    "cube_pixels_not_square": "Nothing for this result. Match the scanner's speed to its pixels, where it can be set.",
+    "cube_camera_not_frame": "Nothing: it says how the cube was recorded.",
+    "cube_camera_unfit": "Record the cube again at an even speed, and touch nothing between photos and cube.",
     "dense_on_gpu": "Nothing: it says where depth was measured.",
     "dense_gpu_failed": "Nothing for this result. Have the worker's GPU looked at, or set it to use the CPU.",
     "backend_run": "Nothing: keep it with the result, so that it can be repeated.",
@@ -77,8 +80,8 @@ REFUSALS = {
     "photo_unlocated": "Take it again with two or more markers in view, between its neighbours.",
 }
 GRAVE = (
-    "specimen_moved", "cube_camera_loose", "scale_implausible", "scale_contradicts_exif", "specimen_not_found",
-    "corners_scatter", "cube_corners_scatter",
+    "specimen_moved", "cube_camera_loose", "cube_camera_unfit", "scale_implausible", "scale_contradicts_exif",
+    "specimen_not_found", "corners_scatter", "cube_corners_scatter",
 )  # fmt: skip
 """Warnings that put all places in doubt."""
 UNKNOWN_REFUSAL = "Take it again from the same side with the markers in view."

@@ -37,8 +37,8 @@ class Anchor:
 @dataclass(frozen=True)
 class CubeCamera:
     """The solved camera: ``view``; RMS corner distance ``rms_px``; ``focal_sd``: one standard deviation of the
-    logarithm of the focal length, as the corners determine it; ``covariance`` (n, n) of the ``model``'s numbers, rotation,
-    translation and log focal length first (:func:`specimap.core.register.models.moved`)."""
+    logarithm of the focal length, as the corners determine it; ``covariance`` (n, n) of the ``model``'s numbers,
+    rotation, translation and log focal length first (:func:`specimap.core.register.models.moved`)."""
 
     view: View
     rms_px: float

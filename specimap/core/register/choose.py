@@ -1,9 +1,9 @@
 """Which kind of camera recorded the cube: what the markers' corners say, and the specimen between them.
 
-Corners in one plane show a push-broom much as a frame camera, and a slower scan much as a camera that looks aslant. What
-differs is how far raised tissue leans, and to which side. So every kind is fitted to corners and tiles of the specimen
-together, once with a specimen that stayed and once with one that moved, and the simplest is taken unless another
-explains clearly more.
+Corners in one plane show a push-broom much as a frame camera, and a slower scan much as a camera that looks aslant.
+What differs is how far raised tissue leans, and to which side. So every kind is fitted to corners and tiles of the
+specimen together, once with a specimen that stayed and once with one that moved, and the simplest is taken unless
+another explains clearly more.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ Look = Callable[[View], Sighting | None]
 
 @dataclass(frozen=True)
 class Choice:
-    """The ``model`` taken and its ``fit``; ``alone``: the same fitted to the corners alone; ``moved``: the specimen lies
-    elsewhere; ``sighting``: what the specimen last showed, through whichever camera; ``open_mm``: how far the kinds that
-    are not ruled out put the specimen apart, sideways, weighted by how likely they are."""
+    """The ``model`` taken and its ``fit``; ``alone``: the same fitted to the corners alone; ``moved``: the specimen
+    lies elsewhere; ``sighting``: what the specimen last showed, through whichever camera; ``open_mm``: how far the
+    kinds that are not ruled out put the specimen apart, sideways, weighted by how likely they are."""
 
     model: Model
     fit: Fit
@@ -118,8 +118,8 @@ def _starts(sight: Sight, rows: int, cols: int, square: CubeCamera | None) -> di
     if not low < flat.aspect < high:
         raise RegistrationError(
             f"A pixel of the cube is {flat.aspect:.2f} times as high as it is wide, by its markers.",
-            advice=f"Give the cube with lines between {low:g} and {high:g} times as long as its columns are wide: record "
-            "it at another speed, or bin its rows or columns.",
+            advice=f"Give the cube with pixels between {low:g} and {high:g} times as high as wide: record it at "
+            "another speed, or bin its rows or columns.",
             aspect=round(flat.aspect, 3),
         )
     starts: dict[Model, View] = {} if square is None else {FRAME: square.view}
@@ -150,8 +150,9 @@ def _with_tissue(views: dict[Model, View], sight: Sight, seen: Sighting) -> dict
     for _ in range(2):
         whole = replace(sight, tissue=Tissue.of(seen, sigma_mm))
         fits = {
-            (model, moved): fit(view, model, whole, motion=moved) for model, view in views.items() for moved in (False, True)
-        }
+            (model, moved): fit(view, model, whole, motion=moved)
+            for model, view in views.items() for moved in (False, True)
+        }  # fmt: skip
         closest = min(fits.values(), key=lambda f: f.cost)
         sigma_mm = max(LEAST_TILE_MM, SIGMA_OF_MAD * float(np.median(np.abs(closest.tile_miss))) * sigma_mm)
     return fits
@@ -171,10 +172,10 @@ def _open_mm(fits: dict[tuple[Model, bool], Fit], best: tuple[Model, bool], plac
         return 0.0
     variance = 0.0
     # A frame camera of square pixels is what cubes without a sign of anything else were recorded with.
-    tissue = len(fits[best].tile_miss) > 0
+    least = -OPEN if best[0] is not FRAME else DOUBTED if len(fits[best].tile_miss) else np.inf
     for key, other in fits.items():
         ahead = fits[best].cost - other.cost
-        if key[0] is best[0] or key[1] != best[1] or ahead < -OPEN or (best[0] is FRAME and (not tissue or ahead < DOUBTED)):
+        if key[0] is best[0] or key[1] != best[1] or ahead < least:
             continue
         share = 1 / (1 + np.exp(np.clip(-ahead / 2, -30, 30)))
         variance = max(variance, share * _apart_mm(fits[best].camera, other.camera.view, places) ** 2)

@@ -95,7 +95,8 @@ POSE = 6
 
 
 def refit(view: View, corners: Floats, pixels: Floats, sigma_px: Floats) -> View:
-    """``view`` moved to where it sees ``corners`` (N, 3) mm best at ``pixels`` (N, 2), ``sigma_px`` (N,); all else stays.
+    """``view`` moved to where it sees ``corners`` (N, 3) mm best at ``pixels`` (N, 2) with ``sigma_px`` (N,); all else
+    stays.
 
     Raises:
         RegistrationError: no camera above the plane sees the corners there.

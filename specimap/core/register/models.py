@@ -40,7 +40,8 @@ STEPS = np.array([1e-3] * 3 + [1.0] * 3 + [0.1, 0.01, 0.01, 0.01])
 
 @dataclass(frozen=True)
 class Model:
-    """A ``kind`` of camera; ``free``: how many of the ten numbers it has, from the first; ``priced``: what it must gain."""
+    """A ``kind`` of camera; ``free``: how many of the ten numbers it has, from the first; ``priced``: what it must gain
+    over a frame camera of square pixels."""
 
     kind: Kind
     free: int
@@ -138,7 +139,7 @@ class Flat:
                 "No camera above the markers sees them as the cube does.",
                 advice="Check that cube and photos show the same, unmoved markers.",
             )
-        return Flat(answer[:, :2], answer[:, 2])
+        return Flat(np.asarray(answer[:, :2], float), np.asarray(answer[:, 2], float))
 
     @property
     def aspect(self) -> float:

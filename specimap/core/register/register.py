@@ -164,7 +164,7 @@ def _placed(
     caster: RayCaster,
     where: tuple[NDArray[np.int32], NDArray[np.float32]] | None,
 ) -> Placement:
-    away = view.eyes(xyz) - xyz
+    away = view.eyes(xyz.astype(float)) - xyz
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     cosine = np.clip((away * normal).sum(1), -1, 1)
     occluded, undercut = np.zeros(len(xyz), bool), np.zeros(len(xyz), bool)

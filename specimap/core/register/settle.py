@@ -64,7 +64,8 @@ class Settled:
     @property
     def moved(self) -> bool:
         """Whether the specimen lies elsewhere in the cube than in the photos."""
-        return self.shift is not None and self.shift.significant and self.shift.moved_mm > MOVED_OVER_UNFIT * self.unfit_mm
+        shift = self.shift
+        return shift is not None and shift.significant and shift.moved_mm > MOVED_OVER_UNFIT * self.unfit_mm
 
     @property
     def sideways_mm(self) -> float:
@@ -90,15 +91,15 @@ class Settled:
         said: list[tuple[str, str]] = []
         view, aspect = self.camera.view, self.camera.view.intrinsics.aspect
         if isinstance(view, ScanView):
-            text = f"The cube was scanned along its {view.scan}, as markers and specimen show: a push-broom camera was solved."
-            said.append(("cube_camera_not_frame", text))
+            text = f"Markers and specimen show that the cube was recorded line by line, one of its {view.scan} at a time: "
+            said.append(("cube_camera_not_frame", text + "a push-broom camera was solved."))
         if abs(aspect - 1) > SQUARE:
-            text = f"The cube's pixels are not square: {aspect:.3f} times as high as wide, which was taken into account."
+            text = f"The cube's pixels are {aspect:.3f} times as high as they are wide; this was accounted for."
             said.append(("cube_pixels_not_square", text))
         if self.shift is not None and self.moved:
             said.append(("specimen_moved", self.shift.message))
         if self.unfit_mm:
-            text = f"No camera sees markers and specimen as the cube shows them: {self.unfit_mm:.2f} mm remain."
+            text = f"No camera sees markers and specimen as the cube shows them: about {self.unfit_mm:.2f} mm remain."
             said.append(("cube_camera_unfit", text))
         elif self.camera_mm > LOOSE_MM:
             text = f"The markers in the cube leave open where raised tissue lies, by about {self.camera_mm:.1f} mm."
