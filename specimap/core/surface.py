@@ -77,11 +77,13 @@ def fuse(
         )
         grid.integrate(blocks, depth, colour, K, K, T, 1.0, far, settings.truncation_voxels)
         progress(done / len(maps))
-    mesh = grid.extract_triangle_mesh(settings.least_weight)
-    if "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
+    # Of a grid without a block Open3D extracts nothing but an exception of its own.
+    mesh = grid.extract_triangle_mesh(settings.least_weight) if grid.hashmap().size() else None
+    if mesh is None or "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
         raise DepthNotFoundError(
-            "The photos gave no common surface.",
+            f"The photos gave no common surface: {len(maps)} depth maps, and nowhere do enough of them agree.",
             advice="Take sharper photos from 10-20 degrees apart, all around, with the specimen in the middle.",
+            maps=len(maps),
         )
     vertices = mesh.vertex.positions.numpy()
     triangles = mesh.triangle.indices.numpy().astype(np.int32)
