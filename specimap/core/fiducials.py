@@ -26,7 +26,7 @@ Bytes = NDArray[np.uint8]
 
 SMALLEST_EDGE_PX = 7.0
 ENLARGED_PX = 1600
-"""A picture is enlarged at most to this, and at most twofold, to be searched again: in a large one markers are large."""
+"""To be searched again a picture is enlarged at most to this, and at most twofold: in a large one markers are large."""
 SHARPENED_PX = 1.5
 TONE_PHOTOS = 8
 """Photos whose markers tell the tone of all."""
@@ -121,7 +121,7 @@ def detect_markers(
 
 
 def measured_at(grey: Bytes, detections: list[Detection], tone: float) -> list[Detection]:
-    """The same markers with their corners measured anew in the linear light of ``grey`` (H, W) to the power ``tone``."""
+    """The same markers, their corners measured anew in the linear light of ``grey`` (H, W) to the power ``tone``."""
     if not detections:
         return []
     light = np.power(linear_from_srgb(grey), np.float32(tone))
