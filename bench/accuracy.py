@@ -10,25 +10,38 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from bench.enlarge import enlarge
 from bench.measure import Measured, measure
 from bench.real import APPLE, bench_apple
 from bench.sample import SAMPLE
 from specimap.core.accuracy import TruthComparison
 from specimap.core.evidence.truth import evenly, judge
+from specimap.core.phantom import PhantomSettings, write_phantom
 
 
 @dataclass(frozen=True)
 class Case:
-    """An acquisition with truth: ``folder``, and the ``share`` of its photos that is used, evenly dropped."""
+    """An acquisition with truth: ``folder``, the ``share`` of its photos that is used, evenly dropped, and the size that
+    they are enlarged to, where they are; ``made_of``: what is written into ``folder`` first."""
 
     name: str
     folder: Path
     share: float = 1.0
+    size: tuple[int, int] | None = None
+    made_of: PhantomSettings | None = None
 
 
-def cases(data: Path | None) -> list[Case]:
-    """The sample, and the phantoms where the test data are at hand."""
-    found = [Case("sample", SAMPLE)]
+SHARP = PhantomSettings(seed=71, photo_size=1280, bands=8, wavelength_nm=(400.0, 1000.0))
+
+
+def cases(data: Path | None, work: Path) -> list[Case]:
+    """The sample, as it is and as a phone's photos; an own phantom; and the others where the test data are at hand."""
+    found = [
+        Case("sample", SAMPLE),
+        Case("sample, enlarged to 3000 x 3000", SAMPLE, size=(3000, 3000)),
+        Case("sample, enlarged to 4000 x 3000", SAMPLE, size=(4000, 3000)),
+        Case("own phantom, sharp at 1280 x 1280", work / "sharp", made_of=SHARP),
+    ]
     if data is not None:
         phantom = data / "phantom_a"
         found += [
@@ -53,10 +66,15 @@ def bench_accuracy(console: Console, work: Path, repeats: int) -> dict[str, obje
         first = heading == "acquisition"
         table.add_column(heading, justify="left" if first else "right", no_wrap=first)
     figures: dict[str, object] = {}
-    for number, case in enumerate(cases(data)):
+    for number, case in enumerate(cases(data, work)):
+        if case.made_of:
+            write_phantom(case.made_of, case.folder)
         photos, out = work / f"case_{number}", work / f"case_{number}_out"
         photos.mkdir(exist_ok=True)
-        for photo in evenly(sorted((case.folder / "rgb").iterdir()), case.share):
+        used = evenly(sorted((case.folder / "rgb").iterdir()), case.share)
+        if case.size:
+            enlarge(used, photos, case.size)
+        for photo in () if case.size else used:
             shutil.copyfile(photo, photos / photo.name)
         run = _measured(photos, case, out, "camera")
         camera = judge(out, case.folder)

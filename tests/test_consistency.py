@@ -142,3 +142,20 @@ def test_views_come_packed_and_no_more_than_wanted(plane: Photographs) -> None:
     for row in views:
         named = row[row >= 0]
         assert len(set(named.tolist())) == len(named)
+
+
+def test_more_vertices_than_one_look_up_takes(plane: Photographs) -> None:
+    """A close-up shows tens of thousands in each photo."""
+    side = np.linspace(-8, 8, 190)
+    x, y = (v.ravel() for v in np.meshgrid(side, side))
+    few = grid(0.0)
+    vertices = np.stack([x, y, np.zeros_like(x)], -1).astype(np.float32)
+    normals = np.tile(UP, (len(x), 1))
+    mesh = Mesh(vertices, few.triangles, normals.astype(np.float32), np.zeros(vertices.shape, np.uint8))
+    assert len(x) > 32_767
+    views = choose_views(mesh, np.arange(len(x)), plane, 6, 0.25)
+    assert (views[:, :LEAST_WITHOUT_HIGHLIGHTS] >= 0).all()
+    offsets = np.array([0.0, 3.0])
+    scores = patch_scores(vertices.astype(float), normals, views, plane, offsets, SAMPLE_MM, 1)
+    assert 0.6 < np.median(scores[:, 0]) < 1
+    assert np.median(scores[:, 1]) < 0.5

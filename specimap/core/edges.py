@@ -36,6 +36,8 @@ MOST_BLUR = 1 / 40
 BLUR_SAMPLES = 41
 SIGMAS_BETWEEN_QUARTERS = 1.349
 """From a quarter to three quarters of a normal distribution."""
+LEAST_RISE = 0.02
+"""Linear light by which an edge must rise for its blur to be told."""
 UNMEASURED_PX = 0.5
 """Standard deviation of an edge, and of a corner, that gave no line."""
 
@@ -108,8 +110,8 @@ def _fit_edges(
 
 
 def outward_normals(a: Floats, b: Floats, dark: Floats) -> tuple[Floats, Floats, Floats]:
-    """Directions (E, 2) along edges from ``a`` to ``b`` (both (E, 2)) and across them, from what is ``dark`` (E, 2) into
-    what is bright, and how far (E,) the edges are from the former."""
+    """Directions (E, 2) along edges from ``a`` to ``b`` (both (E, 2)) and across them, from what is ``dark`` (E, 2)
+    into what is bright, and how far (E,) the edges are from the former."""
     along = (b - a) / np.linalg.norm(b - a, axis=1)[:, None]
     normal = np.stack([along[:, 1], -along[:, 0]], -1)
     depth = _dot(normal, dark - a)
@@ -169,15 +171,15 @@ def edge_blurs(linear: Singles, squares: Floats) -> Floats:
     rise = np.median(sample(linear, x, y, cv2.INTER_CUBIC).reshape(places.shape[:-1]), axis=1).astype(float)
     few = BLUR_SAMPLES // 8
     low, high = rise[:, :few].mean(1, keepdims=True), rise[:, -few:].mean(1, keepdims=True)
-    clear = (high > low).ravel()
-    share = np.maximum.accumulate((rise - low) / np.where(high > low, high - low, 1), axis=1)
+    clear = high - low > LEAST_RISE
+    share = np.maximum.accumulate((rise - low) / np.where(clear, high - low, 1), axis=1)
     quarters = np.stack([(share < quarter).sum(1) for quarter in (0.25, 0.75)], 1).clip(1, BLUR_SAMPLES - 1)
     before, after = (np.take_along_axis(share, quarters - k, 1) for k in (1, 0))
     part = (np.array([0.25, 0.75]) - before) / np.maximum(after - before, 1e-9)
     places_of = quarters - 1 + np.clip(part, 0, 1)
     step = 2 * d[:, -1] / (BLUR_SAMPLES - 1)
     blurs = (places_of[:, 1] - places_of[:, 0]) * step / SIGMAS_BETWEEN_QUARTERS
-    return np.asarray(np.where(clear, blurs, np.nan))
+    return np.asarray(np.where(clear.ravel(), blurs, np.nan))
 
 
 def _fit_robustly(u: Floats, v: Floats, clear: Flags) -> tuple[Floats, Floats, Floats, NDArray[np.int64]]:

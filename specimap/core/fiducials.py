@@ -25,6 +25,9 @@ from specimap.core.tone import TRIALS, shift_of_cells, tone_between
 Bytes = NDArray[np.uint8]
 
 SMALLEST_EDGE_PX = 7.0
+ENLARGED_PX = 1600
+"""To be searched again a picture is enlarged at most to this, and at most twofold: in a large one markers are large."""
+SHARPENED_PX = 1.5
 TONE_PHOTOS = 8
 """Photos whose markers tell the tone of all."""
 DICTIONARY_TRIALS = (
@@ -100,12 +103,13 @@ def detect_markers(
     """
     detector = _detector(dictionary)
     quads, ids, _ = detector.detectMarkers(grey)
-    found = _collect([], quads, ids, 1.0)
+    found = _collect([], quads, ids, (1.0, 1.0))
     if expected is None or len(found) < expected:
-        big = cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
-        sharp = cv2.addWeighted(big, 1.8, cv2.GaussianBlur(big, (0, 0), 3), -0.8, 0)
+        scale = float(np.clip(ENLARGED_PX / max(grey.shape), 1.0, 2.0))
+        big = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+        sharp = cv2.addWeighted(big, 1.8, cv2.GaussianBlur(big, (0, 0), SHARPENED_PX * scale), -0.8, 0)
         quads, ids, _ = detector.detectMarkers(sharp)
-        found = _collect(found, quads, ids, 2.0)
+        found = _collect(found, quads, ids, (big.shape[1] / grey.shape[1], big.shape[0] / grey.shape[0]))
     if not found:
         return []
     light = linear_from_srgb(grey) if linear is None else linear
@@ -117,7 +121,7 @@ def detect_markers(
 
 
 def measured_at(grey: Bytes, detections: list[Detection], tone: float) -> list[Detection]:
-    """The same markers with their corners measured anew in the linear light of ``grey`` (H, W) to the power ``tone``."""
+    """The same markers, their corners measured anew in the linear light of ``grey`` (H, W) to the power ``tone``."""
     if not detections:
         return []
     light = np.power(linear_from_srgb(grey), np.float32(tone))
@@ -149,12 +153,12 @@ def _collect(
     found: list[tuple[int, Floats]],
     quads: Sequence[Array],
     ids: NDArray[np.int32] | None,
-    enlarged: float,
+    enlarged: tuple[float, float],
 ) -> list[tuple[int, Floats]]:
     """Add detections that are new: another id, or the same id a marker's width away."""
     found = list(found)
     for quad, marker_id in zip(quads, [] if ids is None else ids.ravel(), strict=True):
-        corners = (quad.reshape(4, 2).astype(float) + 0.5) / enlarged - 0.5
+        corners = (quad.reshape(4, 2).astype(float) + 0.5) / np.array(enlarged) - 0.5
         edges = np.linalg.norm(corners - np.roll(corners, -1, 0), axis=1)
         if edges.min() < SMALLEST_EDGE_PX:
             continue

@@ -67,7 +67,6 @@ def fuse(
         ("tsdf", "weight", "color"), (core.float32, core.float32, core.float32), ((1,), (1,), (3,)),
         voxel_mm, BLOCK_VOXELS, FIRST_BLOCKS, core.Device("CPU:0"),
     )  # fmt: skip
-    touched = False
     for done, depth_map in enumerate(map(_with_known_depth, maps), 1):
         view = depth_map.view(poses[depth_map.photo])
         depth = o3d.t.geometry.Image(np.ascontiguousarray(depth_map.depth))
@@ -84,14 +83,16 @@ def fuse(
             if "No block is touched" not in str(error):
                 raise
             continue
-        touched = True
         grid.integrate(blocks, depth, colour, K, K, T, NEAREST_MM, far, settings.truncation_voxels)
         progress(done / len(maps))
-    if not touched:
-        raise _no_surface(len(maps))
-    mesh = grid.extract_triangle_mesh(settings.least_weight)
-    if "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
-        raise _no_surface(len(maps))
+    # Of a grid without a block Open3D extracts nothing but an exception of its own.
+    mesh = grid.extract_triangle_mesh(settings.least_weight) if grid.hashmap().size() else None
+    if mesh is None or "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
+        raise DepthNotFoundError(
+            f"{len(maps)} pairs of photos gave depth, but they agree on no surface.",
+            advice="Leave specimen and markers unmoved between photos, which are best 10 to 20 degrees apart.",
+            maps=len(maps),
+        )
     vertices = mesh.vertex.positions.numpy()
     triangles = mesh.triangle.indices.numpy().astype(np.int32)
     colours = np.clip(mesh.vertex.colors.numpy() * 255, 0, 255).astype(np.uint8)
@@ -105,13 +106,6 @@ def fuse(
 def _with_known_depth(depth_map: DepthMap) -> DepthMap:
     depth = depth_map.depth
     return replace(depth_map, depth=np.where(np.isfinite(depth) & (depth > NEAREST_MM), depth, np.float32(0)))
-
-
-def _no_surface(pairs: int) -> DepthNotFoundError:
-    return DepthNotFoundError(
-        f"{pairs} pairs of photos gave depth, but they agree on no surface.",
-        advice="Leave specimen and markers unmoved between photos, which are best 10 to 20 degrees apart.",
-    )
 
 
 def _in_order(

@@ -50,7 +50,7 @@ class DepthSettings:
     many_photos: int = 32
     block_px: int = 3
     matching_share: float = 0.6
-    most_matching_px: int = 640
+    most_matching_px: int = 512
     uniqueness: int = 8
     device: Device = "auto"
 

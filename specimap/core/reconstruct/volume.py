@@ -65,9 +65,13 @@ def volume_over(
 
 def inside_volume(depth: Singles, virtual: Intrinsics, R: Floats, pose: Pose, volume: Volume) -> Singles:
     """Depths whose points lie outside the volume become 0."""
-    v, u = np.indices(depth.shape, dtype=np.float32)
-    rays = np.stack([(u - virtual.cx) / virtual.focal_px, (v - virtual.cy) / virtual.focal_px,
-                     np.ones_like(u)], -1)  # fmt: skip
-    points = (rays * depth[..., None]) @ R.astype(np.float32) + pose.centre.astype(np.float32)
-    keep = ((points >= volume.low) & (points <= volume.high)).all(-1)
+    height, width = depth.shape
+    x = ((np.arange(width) - virtual.cx) / virtual.focal_px).astype(np.float32)
+    y = ((np.arange(height) - virtual.cy) / virtual.focal_px).astype(np.float32)[:, None]
+    R = R.astype(np.float32)
+    keep = np.ones(depth.shape, bool)
+    for axis in range(3):
+        place = (x * R[0, axis] + (y * R[1, axis] + R[2, axis])) * depth
+        place += np.float32(pose.centre[axis])
+        keep &= (place >= volume.low[axis]) & (place <= volume.high[axis])
     return np.where(keep, depth, 0).astype(np.float32)
