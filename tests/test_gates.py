@@ -17,8 +17,8 @@ from specimap.core.document.words import GRAVE, REMARKS, checks, verdict
 from specimap.core.errors import RegistrationError, ResultInsufficientError
 from specimap.core.gates import gated, outlying_photos
 from specimap.core.geometry import look_at
-from specimap.core.pipeline.strays import without_strays
-from specimap.core.reconstruct.backend import CornersInPhotos, Reconstruction
+from specimap.core.reconstruct.backend import CornersInPhotos
+from specimap.core.reconstruct.strays import strays
 from specimap.core.report import PhotoCorners, Report
 
 # ---- figures ------------------------------------------------------------------------------------------
@@ -134,30 +134,20 @@ def test_a_cube_of_other_markers_is_refused() -> None:
 # ---- photos that contradict the rest --------------------------------------------------------------------
 
 
-def posed(stray: dict[int, float]) -> tuple[Reconstruction, CornersInPhotos]:
-    """A layout that ten cameras see; those of ``stray`` are posed so many mm from where they stood."""
+@pytest.mark.parametrize("moved", [{}, {4: 9.0}, {4: 9.0, 7: -12.0}, {0: 40.0}])
+def test_photos_tens_of_pixels_off_are_strays(moved: dict[int, float]) -> None:
+    """A layout that ten cameras see; some are posed so many mm from where they stood."""
     truth, seen = marker_scene(noise_px=0.1)
-    poses = list(truth.poses)
-    for k, mm in stray.items():
+    poses = dict(enumerate(truth.poses))
+    for k, mm in moved.items():
         aside = np.array([mm, 0.0, 0.0])
         poses[k] = look_at(poses[k].centre + aside, aside, np.array([0.0, 0, 1]))
-    empty = np.zeros((0, 3), np.float32)
-    return (
-        Reconstruction(tuple(range(10)), truth.lens, tuple(poses), (), empty, (), ()),
-        CornersInPhotos(seen, (0, 1, 2, 3)),
-    )
-
-
-NAMES = tuple(f"{k}.jpg" for k in range(10))
-
-
-@pytest.mark.parametrize("stray", [{}, {4: 9.0}, {4: 9.0, 7: -12.0}, {0: 40.0}])
-def test_photos_tens_of_pixels_off_are_left_out(stray: dict[int, float]) -> None:
-    kept = without_strays(*posed(stray), NAMES)
-    assert set(kept.photos) == set(range(10)) - set(stray)
-    assert len(kept.poses) == len(kept.photos)
-    assert {r.name for r in kept.refused} == {f"{k}.jpg" for k in stray}
-    assert all(r.code == "photo_foreign" and "px from where" in r.reason for r in kept.refused)
+    found = strays(truth.lens, poses, CornersInPhotos(seen, (0, 1, 2, 3)))
+    assert set(found) == set(moved)
+    assert all(20 < px < 400 for px in found.values())
+    # Photos that show no marker are not judged.
+    blind = CornersInPhotos(seen.of(~np.isin(seen.photo, list(moved))), (0, 1, 2, 3))
+    assert strays(truth.lens, poses, blind) == {}
 
 
 # ---- whole runs -----------------------------------------------------------------------------------------

@@ -27,7 +27,6 @@ from specimap.core.pipeline.artefacts import (
 from specimap.core.pipeline.clock import Clock
 from specimap.core.pipeline.scale import check_scale
 from specimap.core.pipeline.settings import PipelineSettings
-from specimap.core.pipeline.strays import without_strays
 from specimap.core.points import worth_refining
 from specimap.core.raycast import RayCaster
 from specimap.core.reconstruct.backend import ReconstructionBackend, corners_in_photos, detect_in_photos
@@ -100,7 +99,6 @@ def reconstruct_stage(
             workers=workers,
             progress=lambda s: progress(0.2 + 0.8 * s),
         )
-        reconstruction = without_strays(reconstruction, corners, tuple(p.name for p in photos))
         if (zooms != 1).any():
             remark = "focal_breathing", f"The photos' focal lengths differ by {100 * zooms.std():.1f} % " + (
                 "(standard deviation); each photo was brought to the one they share."

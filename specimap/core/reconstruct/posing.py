@@ -15,6 +15,7 @@ from specimap.core.reconstruct.backend import CornersInPhotos, ReconstructSettin
 from specimap.core.reconstruct.features import check_features
 from specimap.core.reconstruct.markers import MarkerSolution, solve_from_markers
 from specimap.core.reconstruct.reaching import Reached, reach_by_motion, reach_by_places
+from specimap.core.reconstruct.strays import strays
 
 BLURRED_SHARE = 0.2
 """A photo whose sharpness is below this share of the median's is called blurred."""
@@ -85,7 +86,9 @@ def pose_photos(
             reached = Reached(poses, ())
         else:
             reached, lens, placed = moved
-    used = tuple(sorted(reached.poses))
+    strayed = strays(lens, reached.poses, corners)
+    used = tuple(sorted(set(reached.poses) - set(strayed)))
+    strange |= {p: _elsewhere(photos[p], px) for p, px in strayed.items()}
     refused = (*strange.values(), *_left_out(photos, [p for p in waiting if p not in reached.poses], weak))
     if len(used) < 3:
         raise TooFewPhotosError(
@@ -126,14 +129,15 @@ def _refuse_two_scenes(photos: list[Photo], solution: MarkerSolution) -> None:
 
 def _strange(photos: list[Photo], solution: MarkerSolution) -> dict[int, Refusal]:
     """Photos whose markers contradict the rest, or are none of the rest's."""
-    foreign = {
-        p: Refusal(photos[p].name, "photo_foreign", f"Its markers stand {rms:.0f} px from where the others show them.")
-        for p, rms in solution.foreign.items()
-    }
+    foreign = {p: _elsewhere(photos[p], rms) for p, rms in solution.foreign.items()}
     return foreign | {
         p: Refusal(photos[p].name, "photo_foreign", "It shows markers, but none that the other photos show.")
         for p in solution.unconnected
     }
+
+
+def _elsewhere(photo: Photo, px: float) -> Refusal:
+    return Refusal(photo.name, "photo_foreign", f"Its markers stand {px:.0f} px from where the others show them.")
 
 
 def _left_out(photos: list[Photo], open_photos: list[int], weak: dict[int, Pose]) -> list[Refusal]:
