@@ -369,7 +369,9 @@ def test_a_declared_ceiling(tmp_path: Path) -> None:
     assert flagged(flags, Flag.SATURATED)[4, 5]
 
 
-@pytest.mark.parametrize(("dtype", "value"), [("f4", 1e6), ("f4", 0.0), ("u2", 65535), ("u2", 0)])
+@pytest.mark.parametrize(
+    ("dtype", "value"), [("f4", 1e6), ("f4", 0.0), ("u2", 65535), ("u2", 0), ("u2", 4115), ("u2", 50000)]
+)
 def test_dead_columns_are_left_out_and_named(tmp_path: Path, dtype: str, value: float) -> None:
     stored, saturated = counts(12, dtype)
     stored = stored + np.array(20, dtype)

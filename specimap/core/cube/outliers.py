@@ -75,7 +75,7 @@ def _upper_bound(positive: Array) -> float:
 
 
 def dead_elements(values: Array) -> NDArray[np.bool_] | None:
-    """Detector elements (cols, bands) that are stuck at zero, or far above their neighbours in every row.
+    """Detector elements (cols, bands) stuck at zero or the largest value, or far above their neighbours in every row.
 
     None where there are none, or too few rows to tell.
     """
@@ -88,6 +88,7 @@ def dead_elements(values: Array) -> NDArray[np.bool_] | None:
         least = np.where(known, np.nanmin(np.where(np.isfinite(values), values, np.inf), 0), np.nan)
         most = np.where(known, np.nanmax(np.where(np.isfinite(values), values, -np.inf), 0), np.nan)
     bright = float(np.nanpercentile(values[::2, ::2], _BRIGHT_PERCENT))
+    largest = float(values.max(initial=-np.inf, where=np.isfinite(values)))
     suspects = np.flatnonzero((((least == 0) & (most == 0)) | (least > bright)).any(0))
     dead = np.zeros(known.shape, bool)
     half = width // 2
@@ -102,7 +103,8 @@ def dead_elements(values: Array) -> NDArray[np.bool_] | None:
         usual_high = usual_high[..., width - 1 - width // 3]
         hot = (low > _HOT * usual_high) & (low > bright)
         stuck = (low == 0) & (high == 0) & (usual_low > 0)
-        dead[:, bands] = hot | stuck
+        full = (low == high) & (low >= largest) & (usual_low < low)
+        dead[:, bands] = hot | stuck | full
     return dead if dead.any() else None
 
 

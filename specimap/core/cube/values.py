@@ -55,9 +55,9 @@ def settle(file_name: str, stored: Pixels, bad_bands: NDArray[np.bool_], declare
     raw = as_unsigned(raw) if unsigned else raw
     missing, values, about_missing = _missing(raw, dtype, declared)
     good = ~bad_bands
-    level = clip_level(_thinned(values[..., good]), dtype, None if declared.divisor else declared.ceiling)
-    meant, dead = values[..., good], None if missing.dead is None else missing.dead[:, good]
-    meant = _thinned(meant if dead is None else np.where(dead, np.nan, meant), by_pixel=True)
+    values = values[..., good]
+    level = clip_level(_thinned(values), dtype, None if declared.divisor else declared.ceiling)
+    meant = _thinned(values, by_pixel=True)
     if gains is not None or offsets is not None:
         meant = meant * (1.0 if gains is None else gains[good]) + (0.0 if offsets is None else offsets[good])
     real = dtype.kind == "f" or gains is not None or offsets is not None
@@ -101,7 +101,7 @@ def _thinned(values: Array, *, by_pixel: bool = False) -> Array:
 
 
 def _missing(raw: Array, dtype: np.dtype, declared: Declared) -> tuple[Missing, Array, Warnings]:
-    """Which stored values stand for none, the sample without them (dead elements still in it), and warnings."""
+    """Which stored values stand for none, the sample without them, and warnings."""
     warnings: Warnings = ()
     finite = [value for value in declared.no_data if np.isfinite(value)]
     possible = tuple(value for value in finite if _holds(dtype, value))
@@ -134,6 +134,7 @@ def _missing(raw: Array, dtype: np.dtype, declared: Declared) -> tuple[Missing, 
         text = f"{int(dead.sum())} detector elements are dead (columns {listed}); their values are taken for none."
         warnings += (("detector_dead", text),)
         missing = Missing(missing.equal, missing.low, missing.high, dead)
+        values = np.where(dead, np.nan, values)
     return missing, values, warnings
 
 
