@@ -18,6 +18,7 @@ from service_scene import Running
 from specimap.core.document import write_document
 from specimap.core.export.formats import KINDS, FileFormat
 from specimap.workers import exports
+from specimap.workers.cells import Cell, Cells
 from specimap.workers.job import JobRun
 
 
@@ -78,9 +79,9 @@ def test_spectra_are_not_fetched(
     seen: list[str] = []
     inner = exports._make
 
-    def watched(work: Path, *arguments: object) -> None:
-        seen.extend(str(path.relative_to(work)) for path in work.rglob("*") if path.is_file())
-        inner(work, *arguments)  # type: ignore[arg-type]
+    def watched(cells: Cells, cell: Cell, *arguments: object) -> None:
+        seen.extend(str(path.relative_to(cell.given)) for path in cell.given.rglob("*") if path.is_file())
+        inner(cells, cell, *arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(exports, "_make", watched)
     made(service, client, result, "html")

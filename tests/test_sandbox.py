@@ -293,6 +293,25 @@ def test_a_command_that_cannot_be_confined_is_not_run(tmp_path: Path) -> None:
     assert "could not be confined" in done.stderr
 
 
+@pytest.mark.parametrize("version", [0, 1])
+def test_without_landlock_what_there_is_holds(version: int, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "folder").mkdir()
+    program = (
+        "import os, socket, sys\n"
+        "from specimap.core.sandbox import Confinement, landlock\n"
+        f"landlock.abi = lambda: {version}\n"
+        "Confinement([], sys.argv[1]).enter(alone=False)\n"
+        "os.rename('file', 'folder/file')\n"
+        "try: socket.socket()\n"
+        "except PermissionError: print('no socket')\n"
+    )
+    for mode in ("best-effort", "require"):
+        command = [sys.executable, "-c", program, mode]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+        assert (done.stdout, done.returncode) == (("no socket\n", 0) if mode == "best-effort" else ("", 1)), done.stderr
+
+
 @pytest.mark.parametrize(
     ("landlock", "seccomp", "missing"),
     [(0, True, "Landlock"), (7, False, "seccomp"), (1, False, "Landlock and seccomp")],

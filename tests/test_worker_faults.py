@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -164,3 +165,29 @@ def test_a_cancelled_job_stops_in_every_stage_and_leaves_nothing(yard: Shop, sma
     assert yard.ended(done).state == "succeeded"
     # Those that wait for the next stages; no other is left.
     assert len(processes_of(["held_stage.py", f"\0{worker.pid}\0"])) <= SPARES
+
+
+LEAVES_A_LINK = """
+import json, os, sys
+spec = json.loads(sys.stdin.readline() or "null")
+if spec:
+    stages = os.path.join(spec["out"], "stages")
+    os.makedirs(stages, exist_ok=True)
+    artefact = os.path.join(stages, f"{spec['stage']}-{spec['keys'][spec['stage']]}.npz")
+    if not os.path.lexists(artefact):
+        os.symlink(os.environ["HOLD_FOLDER"] + "/secret", artefact)
+    print(json.dumps({"event": "done", "seconds": 0.01}), flush=True)
+"""
+
+
+def test_a_stage_that_leaves_a_link_has_failed(yard: Shop, small: OnDisk, tmp_path: Path) -> None:
+    (yard.hold / "secret").write_text("what the service's user alone may read")
+    script = tmp_path / "leaves.py"
+    script.write_text(LEAVES_A_LINK)
+    acquisition = yard.acquisition(small.photos, small.header)
+    yard.start(f"{sys.executable} {script}")
+    job = yard.ended(yard.submit(acquisition))
+    assert job.error is not None
+    assert (job.state, job.error["code"]) == ("failed", "worker_crashed")
+    assert "left something that is no file" in job.error["message"]
+    assert not list(yard.storage.list(f"acquisitions/{acquisition}/stages"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import json
 import os
 import struct
@@ -93,6 +94,8 @@ class Confinement:
             raise self._failed or OSError(0, f"The kernel has no {protection().missing}.")
 
     def _collect(self, rules: Sequence[Rule]) -> None:
+        if landlock.abi() < landlock.LEAST_ABI:
+            raise OSError(errno.ENOSYS, "Landlock: the kernel has none that is of use")
         self._ruleset = landlock.Ruleset()
         self._ruleset.allow(rules)
 
