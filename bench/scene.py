@@ -40,7 +40,7 @@ class Scene:
         self.true_corners = truth.marker_corners[[ids.index(i) for i in stage2.adjusted.marker_ids]]
         _, R, t = fit_similarity(self.true_corners.reshape(-1, 3), stage2.adjusted.corners.reshape(-1, 3))
         self.ours = Pose(R, t)
-        self.true_camera = View(truth.hsi_view.intrinsics, truth.hsi_view.cam_from_world @ self.ours.inverse())
+        self.true_camera = truth.hsi_view.after(self.ours.inverse())
 
     def true_photos(self) -> tuple[Intrinsics, tuple[Pose, ...], Floats]:
         """The photos' true lens, poses and corners in the run's frame."""

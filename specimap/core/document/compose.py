@@ -28,6 +28,9 @@ STAGE_NAMES = {
 }  # fmt: skip
 _HASH = 24
 _VALUE = 120
+_KINDS = {
+    "frame": "a frame camera", "scan_rows": "a push-broom, row by row", "scan_columns": "a push-broom, column by column",
+}  # fmt: skip
 
 
 def compose(material: Material) -> Document:
@@ -144,7 +147,8 @@ def _run(report: Report) -> Iterator[Block]:
             ("Photos' focal length", f"{report.photo_focal_px:.1f} px"),
             ("Cube's camera", f"{camera.distance_mm:.0f} mm above the markers, focal length {camera.focal_px:.0f} px "
              f"± {100 * camera.focal_relative_sd:.0f} %, corners {camera.reprojection_rms_px:.3f} px RMS, roll "
-             f"{camera.roll_deg:.1f} degrees{', mirrored' if camera.mirrored else ''}"),
+             f"{camera.roll_deg:.1f} degrees{', mirrored' if camera.mirrored else ''}; {_KINDS[camera.model]}, pixels "
+             f"{camera.pixel_aspect:.3f} times as high as wide"),
             ("RANSAC of the homography", f"{report.inliers.n} of {report.inliers.of} corners within "
              f"{report.inliers.threshold_px:g} px of the coarse grid, {report.inliers.threshold_mm:g} mm"),
             ("Points", f"{report.coverage.points:,}, of which on the specimen {report.coverage.specimen_points:,}"),

@@ -91,7 +91,7 @@ class Settled:
         said: list[tuple[str, str]] = []
         view, aspect = self.camera.view, self.camera.view.intrinsics.aspect
         if isinstance(view, ScanView):
-            text = f"Markers and specimen show that the cube was recorded line by line, one of its {view.scan} at a time: "
+            text = f"The cube was recorded one of its {view.scan} at a time, as markers and specimen show: "
             said.append(("cube_camera_not_frame", text + "a push-broom camera was solved."))
         if abs(aspect - 1) > SQUARE:
             text = f"The cube's pixels are {aspect:.3f} times as high as they are wide; this was accounted for."
