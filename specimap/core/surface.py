@@ -66,6 +66,8 @@ def fuse(
         voxel_mm, BLOCK_VOXELS, FIRST_BLOCKS, core.Device("CPU:0"),
     )  # fmt: skip
     for done, depth_map in enumerate(maps, 1):
+        if not depth_map.depth.any():
+            continue  # of which Open3D makes an exception
         view = depth_map.view(poses[depth_map.photo])
         depth = o3d.t.geometry.Image(np.ascontiguousarray(depth_map.depth))
         colour = o3d.t.geometry.Image(depth_map.colour.astype(np.float32) / 255)
