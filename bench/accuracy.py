@@ -21,8 +21,8 @@ from specimap.core.phantom import PhantomSettings, write_phantom
 
 @dataclass(frozen=True)
 class Case:
-    """An acquisition with truth: ``folder``, the ``share`` of its photos that is used, evenly dropped, and the size that
-    they are enlarged to, where they are; ``made_of``: what is written into ``folder`` first."""
+    """An acquisition with truth: ``folder``, the ``share`` of its photos that is used, evenly dropped, and the ``size``
+    that they are enlarged to, where they are; ``made_of``: what is written into ``folder`` first."""
 
     name: str
     folder: Path

@@ -49,7 +49,7 @@ def test_any_shape(shape: tuple[int, ...]) -> None:
 @pytest.mark.parametrize("shape", [(MOST + 5000, 12), (12, MOST + 5000), (2 * MOST + 7, 9)])
 def test_images_larger_than_one_call_takes(shape: tuple[int, int]) -> None:
     image = (np.arange(shape[0]) % 97)[:, None] * 3.0 + np.arange(shape[1]) % 89
-    y, x = (g.ravel() for g in np.indices(shape))
+    y, x = (g.ravel().astype(float) for g in np.indices(shape))
     assert (sample(image.astype(np.float32), x, y) == image.ravel()).all()
 
 
