@@ -7,7 +7,8 @@ import pytest
 from test_motion import CORNERS, VIEW
 
 from specimap.core.geometry import Intrinsics, View, look_at
-from specimap.core.register.camera import FOCAL_PRIOR_SD, FOCAL_RANGE, Anchor, CubeCamera, solve_camera
+from specimap.core.register.camera import Anchor, CubeCamera, solve_camera
+from specimap.core.register.models import FOCAL_PRIOR_SD, FOCAL_RANGE
 
 ROWS, COLS = VIEW.intrinsics.height, VIEW.intrinsics.width
 SHARP_PX = 0.02

@@ -14,8 +14,9 @@ from specimap.core.errors import DuplicateMarkersError, MarkersMissingInCubeErro
 from specimap.core.fiducials import dictionary_named
 from specimap.core.geometry import Array, Floats, Intrinsics, View, look_at
 from specimap.core.raycast import RayCaster
-from specimap.core.register.camera import FOCAL_PRIOR_SD, solve_camera
+from specimap.core.register.camera import solve_camera
 from specimap.core.register.cube_markers import find_markers, stretched
+from specimap.core.register.models import FOCAL_PRIOR_SD
 from specimap.core.register.register import fit_homography, place_by_camera, place_by_homography
 from specimap.core.render import render_grid
 

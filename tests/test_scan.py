@@ -96,7 +96,7 @@ def test_a_scan_starts_where_it_sees_the_plane_as_shown(model: object) -> None:
 
 # ---- phantoms -----------------------------------------------------------------------------------------
 
-CUBES = (
+CUBES: tuple[dict[str, object], ...] = (
     {"cube_aspect": 0.7}, {"cube_k1": 0.5},
     {"cube_scan": "rows", "scan_pitch_deg": 8.0, "scan_skew": 0.05},
     {"cube_scan": "columns", "cube_aspect": 1.4, "cube_rotation_deg": 30.0},
@@ -132,6 +132,7 @@ def test_a_level_scan_keeps_its_height_and_frames_the_cards() -> None:
 
 
 def test_a_camera_that_is_none_is_refused() -> None:
-    for change in ({"cube_scan": "spiral"}, {"cube_aspect": 0.0}, {"scan_pitch_deg": 80.0}):
+    wrong: list[dict[str, object]] = [{"cube_scan": "spiral"}, {"cube_aspect": 0.0}, {"scan_pitch_deg": 80.0}]
+    for change in wrong:
         with pytest.raises(SettingsError):
             settings(change)

@@ -29,8 +29,10 @@ STAGE_NAMES = {
 _HASH = 24
 _VALUE = 120
 _KINDS = {
-    "frame": "a frame camera", "scan_rows": "a push-broom, row by row", "scan_columns": "a push-broom, column by column",
-}  # fmt: skip
+    "frame": "a frame camera",
+    "scan_rows": "a push-broom, row by row",
+    "scan_columns": "a push-broom, column by column",
+}
 
 
 def compose(material: Material) -> Document:
