@@ -28,17 +28,17 @@ GROSS_MM = 1.5
     [
         ((512, 512), 0.6),
         ((384, 288), 0.6),
-        ((1066, 800), 0.6),
-        ((1280, 960), 0.5),
-        ((960, 1280), 0.5),
-        ((4000, 3000), 0.16),
+        ((853, 640), 0.6),
+        ((1280, 960), 0.4),
+        ((960, 1280), 0.4),
+        ((4000, 3000), 0.128),
     ],
 )
 def test_small_photos_are_matched_at_a_share_and_large_ones_at_a_size(size: tuple[int, int], shrinkage: float) -> None:
     lens = Intrinsics.centred(*size, 1.2 * max(size))
     found = DepthSettings().shrinkage(lens)
     assert found == pytest.approx(shrinkage)
-    assert found * max(size) <= 640 + 1e-9
+    assert found * max(size) <= 512 + 1e-9
 
 
 def test_the_share_and_the_size_can_be_set() -> None:

@@ -8,20 +8,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
 
 @cache
-def _linear_bytes() -> Singles:
+def _linear_bytes() -> Floats:
     v = np.arange(256) / 255
-    return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
 
 
-def linear_from_srgb(image: NDArray[np.uint8]) -> Singles:
-    """sRGB bytes to linear light in 0..1, same shape."""
+def linear_from_srgb(image: NDArray[np.uint8], power: float = 1.0) -> Singles:
+    """sRGB bytes to linear light in 0..1 to a ``power``, same shape."""
     linear = np.empty(image.shape, np.float32)
     if image.size:  # of nothing OpenCV makes nothing, not an empty array
-        cv2.LUT(image.reshape(-1, 1), _linear_bytes(), linear.reshape(-1, 1))
+        cv2.LUT(image.reshape(-1, 1), (_linear_bytes() ** power).astype(np.float32), linear.reshape(-1, 1))
     return linear
 
 

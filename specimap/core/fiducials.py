@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specimap.core.colour import linear_from_srgb
-from specimap.core.edges import refine_corners
+from specimap.core.edges import UNMEASURED_PX, refine_corners
 from specimap.core.errors import UnknownDictionaryError
 from specimap.core.geometry import Array, Floats
 from specimap.core.tone import TRIALS, shift_of_cells, tone_between
@@ -101,6 +101,12 @@ def detect_markers(
 
     Returns: one Detection a marker seen; an id can stand twice where two markers carry it.
     """
+    found = find_markers(grey, dictionary, expected=expected)
+    return _measured(linear_from_srgb(grey) if linear is None else linear, found) if found else []
+
+
+def find_markers(grey: Bytes, dictionary: str, *, expected: int | None = None) -> list[Detection]:
+    """The markers that :func:`detect_markers` finds, their corners as OpenCV has them: not measured."""
     detector = _detector(dictionary)
     quads, ids, _ = detector.detectMarkers(grey)
     found = _collect([], quads, ids, (1.0, 1.0))
@@ -110,21 +116,15 @@ def detect_markers(
         sharp = cv2.addWeighted(big, 1.8, cv2.GaussianBlur(big, (0, 0), SHARPENED_PX * scale), -0.8, 0)
         quads, ids, _ = detector.detectMarkers(sharp)
         found = _collect(found, quads, ids, (big.shape[1] / grey.shape[1], big.shape[0] / grey.shape[0]))
-    if not found:
-        return []
-    light = linear_from_srgb(grey) if linear is None else linear
-    refined = refine_corners(light, np.stack([quad for _, quad in found]))
-    return [
-        Detection(marker_id, corners, float(sigma))
-        for (marker_id, _), corners, sigma in zip(found, *refined, strict=True)
-    ]
+    return [Detection(marker_id, corners, UNMEASURED_PX) for marker_id, corners in found]
 
 
 def measured_at(grey: Bytes, detections: list[Detection], tone: float) -> list[Detection]:
     """The same markers, their corners measured anew in the linear light of ``grey`` (H, W) to the power ``tone``."""
-    if not detections:
-        return []
-    light = np.power(linear_from_srgb(grey), np.float32(tone))
+    return _measured(linear_from_srgb(grey, tone), detections) if detections else []
+
+
+def _measured(light: NDArray[np.float32], detections: list[Detection]) -> list[Detection]:
     refined = refine_corners(light, np.stack([d.corners_px for d in detections]))
     return [
         Detection(d.marker_id, corners, float(sigma)) for d, corners, sigma in zip(detections, *refined, strict=True)
@@ -137,8 +137,10 @@ def tone_of(greys: list[Bytes], detections: list[list[Detection]], dictionary: s
     number = dictionary_number(dictionary)
 
     def growths(photo: int, trial: float) -> Floats:
-        found = measured_at(greys[photo], detections[photo], trial)
-        light = np.power(linear_from_srgb(greys[photo]), np.float32(trial))
+        if not detections[photo]:
+            return np.zeros(0)
+        light = linear_from_srgb(greys[photo], trial)
+        found = _measured(light, detections[photo])
         return shift_of_cells(light, np.array([d.corners_px for d in found]), [d.marker_id for d in found], number)
 
     # Those that show most, and no more of them than it takes.

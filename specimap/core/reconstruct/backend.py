@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from specimap.core.acquisition import Photo, Refusal
 from specimap.core.errors import DuplicateMarkersError, NoMarkersFoundError, WrongDictionaryError
-from specimap.core.fiducials import Detection, detect_markers, fitting_dictionaries, measured_at, tone_of
+from specimap.core.fiducials import Detection, find_markers, fitting_dictionaries, measured_at, tone_of
 from specimap.core.geometry import Intrinsics, Pose
 from specimap.core.reconstruct.depth import DepthMap, DepthSettings
 from specimap.core.solver import Observations
@@ -169,14 +169,14 @@ def detect_in_photos(
     expected = 4  # the published layout; a photo that shows fewer is searched a second time, enlarged
     found: list[list[Detection]] = []
     with ThreadPoolExecutor(workers) as pool:
-        for one in pool.map(lambda p: detect_markers(p.grey, dictionary, expected=expected), photos):
+        for one in pool.map(lambda p: find_markers(p.grey, dictionary, expected=expected), photos):
             found.append(one)
             progress(0.8 * len(found) / len(photos))
         tone = tone_of([p.grey for p in photos], found, dictionary, workers=workers)
-        if abs(tone - 1) > LEAST_TONE:
-            found = list(pool.map(lambda photo, one: measured_at(photo.grey, one, tone), photos, found))
+        tone = tone if abs(tone - 1) > LEAST_TONE else 1.0
+        measured = list(pool.map(lambda photo, one: measured_at(photo.grey, one, tone), photos, found))
     progress(1.0)
-    return found
+    return measured
 
 
 def sparse_points(maps: list[DepthMap], poses: tuple[Pose, ...], per_map: int = 200) -> NDArray[np.float32]:
