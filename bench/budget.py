@@ -14,17 +14,18 @@ from scipy.ndimage import map_coordinates
 
 from bench.sample import SAMPLE
 from bench.scene import Scene, scaled_maps
-from specimap.core.acquisition import photo_paths, read_photos
+from specimap.core.acquisition import read_photos
 from specimap.core.evidence.truth import SPECIMEN
 from specimap.core.geometry import Floats, Pose, View, fit_similarity
 from specimap.core.phantom import load_truth
+from specimap.core.photofolder import photo_paths
 from specimap.core.pipeline.clock import Clock
 from specimap.core.pipeline.outputs import Outputs
 from specimap.core.pipeline.settings import PipelineSettings
 from specimap.core.pipeline.stages import adjust_stage, mesh_of, reconstruct_stage
 from specimap.core.raycast import RayCaster
 from specimap.core.reconstruct.dense import dense_depth
-from specimap.core.reconstruct.depth import volume_over
+from specimap.core.reconstruct.volume import volume_over
 from specimap.core.surface import Mesh
 
 

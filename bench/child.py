@@ -14,9 +14,9 @@ from dataclasses import asdict
 from pathlib import Path
 
 from bench.tracing import tracing
-from specimap.core.acquisition import photo_paths
 from specimap.core.cube import open_cube
 from specimap.core.jsontext import json_text
+from specimap.core.photofolder import photo_paths
 from specimap.core.pipeline import Inputs, Outputs, run_pipeline
 from specimap.core.pipeline.artefacts import load_stage1, load_stage2
 from specimap.core.pipeline.clock import Clock

@@ -11,12 +11,13 @@ import numpy as np
 from rich.console import Console
 
 from bench.service.sheet import NONE, Sheet
-from specimap.core.acquisition import AcquisitionSettings, Photo, photo_paths, read_photos
+from specimap.core.acquisition import AcquisitionSettings, Photo, read_photos
 from specimap.core.errors import SpecimapError
 from specimap.core.geometry import Floats, Pose, fit_similarity
 from specimap.core.phantom import PhantomSettings, write_phantom
 from specimap.core.phantom.truth import Truth
 from specimap.core.phantom.views import photo_views
+from specimap.core.photofolder import photo_paths
 from specimap.core.raycast import RayCaster
 from specimap.core.reconstruct.backend import (
     CornersInPhotos,
@@ -25,9 +26,10 @@ from specimap.core.reconstruct.backend import (
     detect_in_photos,
 )
 from specimap.core.reconstruct.dense import dense_depth
-from specimap.core.reconstruct.depth import DepthSettings, volume_over
+from specimap.core.reconstruct.depth import DepthSettings
 from specimap.core.reconstruct.features import aliked_missing
 from specimap.core.reconstruct.posing import Posed, pose_photos
+from specimap.core.reconstruct.volume import volume_over
 from specimap.core.surface import Mesh, SurfaceSettings, fuse, vertex_normals
 
 PHOTOS = 16

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from specimap.core.acquisition import photo_paths
+from specimap.core.photofolder import photo_paths
 from specimap.core.pipeline.clock import Clock
 from specimap.core.pipeline.finish import triangulated_edges
 from specimap.core.pipeline.outputs import Outputs

@@ -15,9 +15,9 @@ from scipy.optimize import minimize
 
 from bench.scene import Scene, scaled_maps
 from bench.service.sheet import Sheet
-from specimap.core.acquisition import photo_paths
 from specimap.core.geometry import Floats
 from specimap.core.phantom import PhantomSettings, load_truth, write_phantom
+from specimap.core.photofolder import photo_paths
 from specimap.core.pipeline.clock import Clock
 from specimap.core.pipeline.outputs import Outputs
 from specimap.core.pipeline.settings import PipelineSettings

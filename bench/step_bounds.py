@@ -27,11 +27,11 @@ from PIL import Image
 
 from bench.bound import bound_seconds
 from bench.child import parsed, settings_of
-from specimap.core.acquisition import photo_paths
 from specimap.core.cloud import Cloud
 from specimap.core.cube import open_cube
 from specimap.core.jsontext import json_text
 from specimap.core.native import open3d
+from specimap.core.photofolder import photo_paths
 from specimap.core.pipeline import stages
 from specimap.core.pipeline.clock import Clock
 from specimap.core.pipeline.outputs import Outputs, prepare_folder

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from specimap.core.acquisition import AcquisitionSettings, Photo, photo_paths, read_photos
+from specimap.core.acquisition import AcquisitionSettings, Photo, read_photos
 from specimap.core.adjust import AdjustSettings, Form, adjust
 from specimap.core.geometry import Array, Floats, Intrinsics, Pose, View, fit_similarity
 from specimap.core.phantom import PhantomSettings
 from specimap.core.phantom.phantom import Phantom
 from specimap.core.phantom.truth import Truth
+from specimap.core.photofolder import photo_paths
 from specimap.core.reconstruct.backend import (
     CornersInPhotos,
     Reconstruction,

@@ -13,7 +13,8 @@ from specimap.core.geometry import Floats, Intrinsics, Pose
 from specimap.core.phantom import Phantom, PhantomSettings
 from specimap.core.points import worth_refining
 from specimap.core.reconstruct.dense import dense_depth
-from specimap.core.reconstruct.depth import Bytes, DepthMap, DepthSettings, Volume, volume_over
+from specimap.core.reconstruct.depth import Bytes, DepthMap, DepthSettings
+from specimap.core.reconstruct.volume import Volume, volume_over
 from specimap.core.refine import pixel_footprint_mm
 from specimap.core.surface import Mesh, SurfaceSettings, fuse
 

@@ -12,8 +12,9 @@ import pytest
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
-from specimap.core.acquisition import AcquisitionSettings, photo_paths, read_photo, read_photos
+from specimap.core.acquisition import AcquisitionSettings, read_photo, read_photos
 from specimap.core.errors import NotFoundError, PhotoUnreadableError, TooFewPhotosError
+from specimap.core.photofolder import photo_paths
 
 SETTINGS = AcquisitionSettings(working_px=160, least_photos=3)
 

@@ -73,7 +73,8 @@ def test_two_scenes(small: OnDisk, second: str, request: pytest.FixtureRequest, 
 @pytest.fixture
 def shallow(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path, OnDisk], dict[str, str]]:
     """Pose photos without measuring depth; returns the code of each photo that was refused, by name."""
-    from specimap.core.acquisition import AcquisitionSettings, photo_paths, read_photos
+    from specimap.core.acquisition import AcquisitionSettings, read_photos
+    from specimap.core.photofolder import photo_paths
     from specimap.core.reconstruct import colmap
     from specimap.core.reconstruct.backend import ReconstructSettings, corners_in_photos, detect_in_photos
 

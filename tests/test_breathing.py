@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from scenes import EDGE_MM, marker_scene
 
-from specimap.core.acquisition import AcquisitionSettings, Photo, photo_paths, read_photos, stated_focal_px
+from specimap.core.acquisition import AcquisitionSettings, Photo, read_photos, stated_focal_px
 from specimap.core.fiducials import detect_markers
 from specimap.core.geometry import Floats, Intrinsics, fit_similarity
 from specimap.core.phantom import Phantom, PhantomSettings
+from specimap.core.photofolder import photo_paths
 from specimap.core.reconstruct.backend import CornersInPhotos, corners_in_photos, detect_in_photos
 from specimap.core.reconstruct.breathing import (
     bring_to_shared,

@@ -14,8 +14,8 @@ from specimap.core.reconstruct.agreement import confirmed, nearest_photos
 from specimap.core.reconstruct.da3.backend import Metric, in_millimetres, maps_of, smooth_surface
 from specimap.core.reconstruct.da3.bend import bend
 from specimap.core.reconstruct.da3.prepare import conditioning, plan_preparation, windows
-from specimap.core.reconstruct.depth import Singles, volume_over
 from specimap.core.reconstruct.learned.alignment import align, depths_at, on_markers
+from specimap.core.reconstruct.volume import Singles, volume_over
 from specimap.core.solver import Observations
 
 

@@ -14,7 +14,7 @@ import pytest
 from da3_oracle import FACTS, oracle, random_weights, write_script
 from scenes import SMALL, OnDisk
 
-from specimap.core.acquisition import AcquisitionSettings, Photo, photo_paths, read_photos
+from specimap.core.acquisition import AcquisitionSettings, Photo, read_photos
 from specimap.core.errors import (
     BackendFailedError,
     BackendUnavailableError,
@@ -25,6 +25,7 @@ from specimap.core.errors import (
 )
 from specimap.core.evidence.truth import judge
 from specimap.core.geometry import look_at
+from specimap.core.photofolder import photo_paths
 from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline, stages
 from specimap.core.reconstruct.backend import (
     CornersInPhotos,

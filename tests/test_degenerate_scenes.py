@@ -26,8 +26,9 @@ from specimap.core.points import cloud_points
 from specimap.core.preview import write_preview
 from specimap.core.raycast import RayCaster
 from specimap.core.reconstruct.dense import dense_depth
-from specimap.core.reconstruct.depth import DepthMap, DepthSettings, volume_over
+from specimap.core.reconstruct.depth import DepthMap, DepthSettings
 from specimap.core.reconstruct.markers import solve_from_markers
+from specimap.core.reconstruct.volume import volume_over
 from specimap.core.refine import RefineSettings, refine_mesh
 from specimap.core.register.register import fit_homography, place_by_camera, place_by_homography
 from specimap.core.render import extent_of, render_grid

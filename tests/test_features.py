@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scenes import OnDisk, rotation_deg
 
-from specimap.core.acquisition import AcquisitionSettings, Photo, photo_paths, read_photos
+from specimap.core.acquisition import AcquisitionSettings, Photo, read_photos
 from specimap.core.geometry import Intrinsics, View, look_at
+from specimap.core.photofolder import photo_paths
 from specimap.core.reconstruct.features import Sift, colmap_camera, extract, match, triangulate_pair
 from specimap.core.reconstruct.locating import Locator
 

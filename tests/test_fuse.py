@@ -9,7 +9,8 @@ import pytest
 
 from specimap.core.errors import DepthNotFoundError
 from specimap.core.geometry import Intrinsics, Pose
-from specimap.core.reconstruct.depth import DepthMap, Volume, inside_volume
+from specimap.core.reconstruct.depth import DepthMap
+from specimap.core.reconstruct.volume import Volume, inside_volume
 from specimap.core.surface import SurfaceSettings, fuse
 
 LENS = Intrinsics.centred(40, 30, 50.0)

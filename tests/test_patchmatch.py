@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from specimap.core.geometry import Intrinsics, Pose, View, look_at
 from specimap.core.reconstruct import patchmatch
-from specimap.core.reconstruct.depth import DepthSettings, Volume, choose_pairs
+from specimap.core.reconstruct.depth import DepthSettings, choose_pairs
 from specimap.core.reconstruct.patchmatch_child import (
     WATCH_SECONDS,
     depth_file,
@@ -23,6 +23,7 @@ from specimap.core.reconstruct.patchmatch_child import (
     run,
     write_workspace,
 )
+from specimap.core.reconstruct.volume import Volume
 
 LENS = Intrinsics(200, 160, 300.0, 101.5, 77.25, 0.08, -0.02)
 UP = np.array([0.0, 0, 1])

@@ -13,15 +13,17 @@ import pytest
 from scenes import SMALL, OnDisk
 from true_depth import true_depth
 
-from specimap.core.acquisition import AcquisitionSettings, photo_paths, read_photos
+from specimap.core.acquisition import AcquisitionSettings, read_photos
 from specimap.core.errors import BackendFailedError, BackendUnavailableError, CancelledError
 from specimap.core.evidence.truth import judge
 from specimap.core.geometry import Floats
 from specimap.core.phantom import Phantom
+from specimap.core.photofolder import photo_paths
 from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline
 from specimap.core.reconstruct import patchmatch
 from specimap.core.reconstruct.dense import dense_depth
-from specimap.core.reconstruct.depth import DepthMap, DepthSettings, volume_over
+from specimap.core.reconstruct.depth import DepthMap, DepthSettings
+from specimap.core.reconstruct.volume import volume_over
 
 
 class Scene:

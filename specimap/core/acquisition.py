@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from specimap.core.errors import PhotoRawError, PhotoUnreadableError, TooFewPhotosError
 from specimap.core.photofile import CameraStated, decode_photo
 from specimap.core.photofolder import photo_folder
-from specimap.core.photofolder import photo_paths as photo_paths
 
 RECOMMENDED_PHOTOS = 20
 FULL_FRAME_DIAGONAL_MM = math.hypot(36, 24)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from specimap.core.acquisition import photo_paths
 from specimap.core.errors import CubeNotFoundError, NotFoundError
+from specimap.core.photofolder import photo_paths
 
 PHOTO_FOLDERS = ("rgb", "photos")
 CUBE_FOLDERS = ("hsi", "cube")

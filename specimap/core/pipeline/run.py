@@ -8,9 +8,8 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from specimap.core.acquisition import photo_paths
 from specimap.core.cube import inspect, open_cube
-from specimap.core.photofolder import photo_folder
+from specimap.core.photofolder import photo_folder, photo_paths
 from specimap.core.pipeline.artefacts import load_stage2
 from specimap.core.pipeline.clock import STAGES, Clock, Progress
 from specimap.core.pipeline.keys import digest_of, register_key, surface_keys

@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from specimap.core.acquisition import photo_paths
 from specimap.core.cube import Cube, inspect, open_cube
 from specimap.core.errors import NotFoundError
+from specimap.core.photofolder import photo_paths
 from specimap.core.pipeline.artefacts import Stage1, Stage2, load_stage1, load_stage2
 from specimap.core.pipeline.clock import Clock, Progress
 from specimap.core.pipeline.failures import told_as_stage_failure

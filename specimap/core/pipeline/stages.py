@@ -31,9 +31,10 @@ from specimap.core.points import worth_refining
 from specimap.core.raycast import RayCaster
 from specimap.core.reconstruct.backend import ReconstructionBackend, corners_in_photos, detect_in_photos
 from specimap.core.reconstruct.breathing import settle_breathing
-from specimap.core.reconstruct.depth import DepthMap, volume_over
+from specimap.core.reconstruct.depth import DepthMap
 from specimap.core.reconstruct.learned.required import check_required
 from specimap.core.reconstruct.resolution import at_own_resolution
+from specimap.core.reconstruct.volume import volume_over
 from specimap.core.refine import Refined, pixel_footprint_mm, refine_mesh
 from specimap.core.render import Grid, extent_of, render_grid
 from specimap.core.surface import fuse

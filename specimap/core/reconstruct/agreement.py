@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specimap.core.geometry import Floats, Pose, View
-from specimap.core.reconstruct.depth import Bytes, Singles
+from specimap.core.reconstruct.depth import Bytes
+from specimap.core.reconstruct.volume import Singles
 
 SEEN_BEHIND = 4.0
 """A depth this many tolerances behind the other photo's is hidden there: that photo has no say."""

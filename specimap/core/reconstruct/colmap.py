@@ -11,9 +11,9 @@ from specimap.core.reconstruct.backend import (
     ReconstructSettings,
     sparse_points,
 )
-from specimap.core.reconstruct.depth import volume_over
 from specimap.core.reconstruct.patchmatch import measure_depth
 from specimap.core.reconstruct.posing import pose_photos
+from specimap.core.reconstruct.volume import volume_over
 
 
 class ColmapBackend:

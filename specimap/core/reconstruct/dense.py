@@ -16,12 +16,12 @@ from specimap.core.reconstruct.depth import (
     Bytes,
     DepthMap,
     DepthSettings,
-    Volume,
     before_shrinking,
     choose_pairs,
     match_pair,
     shared_share,
 )
+from specimap.core.reconstruct.volume import Volume
 
 COARSE_PX = 256
 COARSE_PAIRS = 10

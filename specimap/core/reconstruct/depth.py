@@ -14,11 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specimap.core.geometry import Floats, Intrinsics, Pose, View
-from specimap.core.reconstruct.volume import Singles as Singles
-from specimap.core.reconstruct.volume import Volume as Volume
-from specimap.core.reconstruct.volume import inside_volume as inside_volume
-from specimap.core.reconstruct.volume import lattice_over
-from specimap.core.reconstruct.volume import volume_over as volume_over
+from specimap.core.reconstruct.volume import Singles, Volume, inside_volume, lattice_over
 
 MOST_DISPARITIES = 512
 OWN_BLUR_PX = 0.5

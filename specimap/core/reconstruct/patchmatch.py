@@ -19,18 +19,10 @@ from specimap.core.errors import BackendFailedError, BackendUnavailableError, De
 from specimap.core.geometry import Floats, Intrinsics, Pose, View
 from specimap.core.reconstruct.agreement import confirmed, nearest_photos, share_confirmed
 from specimap.core.reconstruct.dense import dense_depth
-from specimap.core.reconstruct.depth import (
-    Bytes,
-    DepthMap,
-    DepthSettings,
-    Singles,
-    Volume,
-    choose_pairs,
-    cropped_map,
-    inside_volume,
-)
+from specimap.core.reconstruct.depth import Bytes, DepthMap, DepthSettings, choose_pairs, cropped_map
 from specimap.core.reconstruct.learned.environment import DENSE_DEVICE
 from specimap.core.reconstruct.learned.process import run_child
+from specimap.core.reconstruct.volume import Singles, Volume, inside_volume
 
 CHILD = Path(__file__).with_name("patchmatch_child.py")
 SOURCES = 8

@@ -23,11 +23,12 @@ from specimap.core.reconstruct.da3.bend import bend
 from specimap.core.reconstruct.da3.known import placed_features
 from specimap.core.reconstruct.da3.prepare import conditioning, plan_preparation, windows
 from specimap.core.reconstruct.da3.settings import NAME, PREFIX, Da3Settings, settings_from_environment
-from specimap.core.reconstruct.depth import Bytes, DepthMap, Singles, Volume, cropped_map, inside_volume, volume_over
+from specimap.core.reconstruct.depth import Bytes, DepthMap, cropped_map
 from specimap.core.reconstruct.learned.alignment import LARGEST_SCATTER, align, depths_at, on_markers
 from specimap.core.reconstruct.learned.process import Answer, run_child
 from specimap.core.reconstruct.learned.remarks import left_out, ran
 from specimap.core.reconstruct.posing import pose_photos
+from specimap.core.reconstruct.volume import Singles, Volume, inside_volume, volume_over
 
 CHILD = Path(__file__).with_name("child.py")
 STEEPEST = 6.0

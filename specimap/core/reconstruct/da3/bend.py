@@ -6,8 +6,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from specimap.core.geometry import Floats
-from specimap.core.reconstruct.depth import Singles
 from specimap.core.reconstruct.learned.alignment import NEAR
+from specimap.core.reconstruct.volume import Singles
 from specimap.core.robust import SIGMA_OF_MAD
 
 REACH = 0.025

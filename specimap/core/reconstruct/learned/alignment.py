@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from specimap.core.geometry import Floats, View
-from specimap.core.reconstruct.depth import Singles
+from specimap.core.reconstruct.volume import Singles
 from specimap.core.robust import SIGMA_OF_MAD
 from specimap.core.solver import Observations
 

@@ -9,9 +9,10 @@ import numpy as np
 
 from specimap.core.errors import DepthNotFoundError
 from specimap.core.geometry import Floats, Intrinsics
-from specimap.core.reconstruct.depth import Bytes, DepthMap, Singles, cropped_map, inside_volume, volume_over
+from specimap.core.reconstruct.depth import Bytes, DepthMap, cropped_map
 from specimap.core.reconstruct.mast3r.metric import Metric, Predicted
 from specimap.core.reconstruct.mast3r.settings import PREFIX
+from specimap.core.reconstruct.volume import Singles, inside_volume, volume_over
 
 EDGE_SHARE = 0.01
 """Neighbouring depths that differ by more than this share are two surfaces: nothing is interpolated between them."""

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from specimap.core.adjust import Adjusted, AdjustSettings, adjust
 from specimap.core.geometry import Floats, Intrinsics, Pose, View, rotation_from_vector
 from specimap.core.reconstruct.backend import CornersInPhotos
-from specimap.core.reconstruct.depth import Singles
 from specimap.core.reconstruct.learned.alignment import Alignment, align, depths_at, on_markers
 from specimap.core.reconstruct.learned.placing import Placed
 from specimap.core.reconstruct.mast3r.images import Preparation
+from specimap.core.reconstruct.volume import Singles
 
 POINTS_PER_PHOTO = 400
 LEAST_POINTS = 200
