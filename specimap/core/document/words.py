@@ -17,7 +17,7 @@ LAYOUT_MARKERS = 8
 
 REMARKS = {
     "few_photos": f"Take {RECOMMENDED_PHOTOS} or more photos from all around; the errors then become smaller.",
-    "scale_implausible": "Measure the black edge of a printed marker with a calliper and give that number as the edge.",
+    "scale_implausible": "Measure the print with a calliper and give the edge of the black square in millimetres.",
     "scale_contradicts_exif": "Measure the black edge of a printed marker and compare it with the edge that was given.",
     "markers_missing_in_cube": "Record the cube again with all markers in view, lit, in focus and uncovered.",
     "markers_not_in_band_mean": "Nothing, where the corners in the cube fit; else light the markers better.",
