@@ -101,3 +101,18 @@ def test_a_white_of_another_exposure_is_noticed(tmp_path: Path, share: float, sa
     reference = write_envi(tmp_path / "w.hdr", np.rint(white * share).astype("u2"))
     cube = open_cube(raw, white=reference)
     assert ("reflectance_implausible" in dict(cube.warnings)) == said
+
+
+@pytest.mark.parametrize(
+    ("of_white", "of_raw", "said"),
+    [("9.96", "9.96", False), ("10.0", "9.96", False), ("2.0", "10.0", True), ("2 ms", "10 ms", True),
+     ("", "10", False), ("{1, 2}", "10", False), ("0", "10", False), ("auto", "10", False)],
+)  # fmt: skip
+def test_an_exposure_that_differs_is_said(tmp_path: Path, of_white: str, of_raw: str, said: bool) -> None:
+    values = random_values("u2", (4, 5, 11)) // 20 + 100
+    raw = write_envi(tmp_path / "raw.hdr", values, tint=of_raw)
+    dark = write_envi(tmp_path / "dark.hdr", np.full_like(values, 90), tint=of_raw)
+    cube = open_cube(raw, white=write_envi(tmp_path / "w.hdr", values[:1] + 50, tint=of_white), dark=dark)
+    told = dict(cube.warnings).get("reference_exposure_differs", "")
+    assert bool(told) == said
+    assert not said or "white reference was exposed 0.2 times as long" in told

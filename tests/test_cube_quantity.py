@@ -1,4 +1,4 @@
-"""What a cube's values are: reflectance only where nothing speaks against it, and never where the file says otherwise."""
+"""What a cube's values are: reflectance only where the file does not call them something else."""
 
 from __future__ import annotations
 
@@ -136,9 +136,7 @@ def test_a_no_data_value_of_gdal_prints_nothing(
     values = scene().transpose(2, 0, 1).copy()
     values[:, :5] = np.finfo("f4").min
     tag = (42113, "s", 0, "-3.4028234663852886e+38", True)
-    tifffile.imwrite(
-        tmp_path / "x.tif", values, planarconfig="separate", photometric="minisblack", extratags=[tag]
-    )
+    tifffile.imwrite(tmp_path / "x.tif", values, planarconfig="separate", photometric="minisblack", extratags=[tag])
     with caplog.at_level(logging.WARNING):
         read = open_cube(tmp_path / "x.tif").read_rows(0, 24)
     assert np.isnan(read[:5]).all()

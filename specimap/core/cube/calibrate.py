@@ -24,6 +24,7 @@ from specimap.core.geometry import Array, Floats
 _LEAST_CLIPPED_WHITE = 0.002
 # Wider apart than a band of any imager: the reference was taken with other settings.
 _WAVELENGTH_TOLERANCE_NM = 1.0
+_EXPOSURE_TOLERANCE = 0.01
 # A spectrum of fewer bands may well be zero in all.
 _LEAST_BANDS = 3
 
@@ -32,7 +33,8 @@ def calibrated(raw: Cube, white: Cube, dark: Cube | None) -> Cube:
     """The cube of reflectance (float32) of a raw cube. Without a dark reference, 0 counts are taken as dark.
 
     Where the white is not brighter than the dark, a reference has no value, or the raw cube holds zeros in all bands,
-    reflectance is NaN. Saturation stays that of the raw counts. Raises CubeContentError for a reference whose columns or bands do not fit.
+    reflectance is NaN. Saturation stays that of the raw counts. Raises CubeContentError for a reference whose columns
+    or bands do not fit.
     """
     warnings: Warnings = _fit(raw, white, "white") + (_fit(raw, dark, "dark") if dark else ())
     scales, about_units = _to_common_units(raw, white, dark)
@@ -85,11 +87,18 @@ def _fit(raw: Cube, reference: Cube, name: str) -> Warnings:
             expected=[raw.cols, raw.bands],
             found=[reference.cols, reference.bands],
         )
+    warnings: Warnings = ()
+    if raw.exposure and reference.exposure and abs(reference.exposure / raw.exposure - 1) > _EXPOSURE_TOLERANCE:
+        text = (
+            f"The {name} reference was exposed {reference.exposure / raw.exposure:.3g} times as long as the cube, as "
+            "their files say; values are used as they stand."
+        )
+        warnings = (("reference_exposure_differs", text),)
     apart = np.abs(reference.wavelengths_nm - raw.wavelengths_nm)
     if (apart > _WAVELENGTH_TOLERANCE_NM).any():  # NaN, where either names none, does not count
         text = f"The {name} reference's wavelengths are up to {np.nanmax(apart):.1f} nm off the cube's."
-        return ((f"{name}_wavelengths_differ", text),)
-    return ()
+        warnings += ((f"{name}_wavelengths_differ", text),)
+    return warnings
 
 
 def _to_common_units(raw: Cube, white: Cube, dark: Cube | None) -> tuple[tuple[float, float], Warnings]:

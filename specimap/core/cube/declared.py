@@ -27,8 +27,10 @@ _CEILING = ("ceiling", "saturationlevel", "saturationvalue")
 _BITS = "bitdepth"
 _VALID = ("validmin", "validmax", "validrange")
 _UNSIGNED = "unsigned"
+_EXPOSURE = ("tint", "integrationtime", "exposuretime", "exposure")
 WORDS = frozenset((
     *_NO_DATA, *_GAINS, *_OFFSETS, *_REFLECTANCE_GAINS, *_REFLECTANCE_OFFSETS, _DIVISOR, *_CEILING, _BITS, *_VALID,
+    *_EXPOSURE,
 ))  # fmt: skip
 """What the names of attributes and variables are compared with, see :func:`plain`."""
 # What other quantities are called, or their units, in which values may lie between 0 and 1 as well.
@@ -39,6 +41,7 @@ _OTHER_QUANTITY = re.compile(
 )
 _NOTHING = ("", "none", "null", "na", "n/a")
 _LONGEST = 100_000
+_LEADING_NUMBER = re.compile(r"\s*[0-9]*\.?[0-9]+(e[+-]?[0-9]+)?(?=\s*[a-zµ]*\s*$)", re.IGNORECASE)
 _SEPARATORS = re.compile(r"[\s,{}\[\]()]+")
 
 
@@ -49,8 +52,8 @@ class Declared:
     ``no_data``: stored values that stand for none, beside NaN. ``valid``: stored values outside of these two are
     none. ``gains``, ``offsets`` (1,) or (B,): stored * gain + offset is the value; ``divisor``: the value by it is
     reflectance. ``names`` of the fields that gave them, for messages. ``ceiling``: the stored value at which the
-    sensor clips. ``unsigned``: integers are to be read without sign. ``reflectance``: the file calls its values so. ``other``:
-    what it calls them instead, such as radiance.
+    sensor clips. ``unsigned``: integers are to be read without sign. ``reflectance``: the file calls its values so.
+    ``other``: what it calls them instead, such as radiance. ``exposure``: of a line, in the file's own unit.
     """
 
     no_data: tuple[float, ...] = ()
@@ -62,6 +65,7 @@ class Declared:
     unsigned: bool = False
     reflectance: bool = False
     other: str | None = None
+    exposure: float | None = None
     names: Mapping[str, str] | None = None
     warnings: Warnings = ()
 
@@ -123,6 +127,7 @@ def declared_of(
         unsigned=_UNSIGNED in found and str(_text(found[_UNSIGNED][1])).lower() == "true",
         reflectance=named or divisor is not None,
         other=other,
+        exposure=reader.exposure(),
         names=names,
         warnings=warnings,
     )
@@ -241,6 +246,14 @@ class _Reader:
         if low is None and high is None:
             return None
         return (-np.inf if low is None else float(low[0]), np.inf if high is None else float(high[0]))
+
+    def exposure(self) -> float | None:
+        """Of several words the first that is one positive number, which may carry its unit (``10 ms``)."""
+        for key in _EXPOSURE:
+            found = _LEADING_NUMBER.match(str(_text(self._found[key][1]))) if key in self._found else None
+            if found is not None and np.isfinite(value := float(found[0])) and value > 0:
+                return value
+        return None
 
     def ceiling(self) -> float | None:
         for key in _CEILING:

@@ -38,6 +38,7 @@ REMARKS = {
     "reflectance_implausible": "Check scale factor and offset in the cube's file before reading any spectrum.",
     "quantity_not_reflectance": "Give a white frame of the same kind, or a cube of reflectance, where that is needed.",
     "reference_units_differ": "Give cube, white and dark frame alike: all as counts of the same export.",
+    "reference_exposure_differs": "Record cube and references with one exposure, or bring their counts to one first.",
     "white_saturated": "Record the white frame again with a shorter exposure: reflectance is too high where it clips.",
     "saturated": "Expose the cube shorter: saturated pixels are flagged and carry no true spectrum.",
     "wavelengths_missing": "Export the cube with its wavelengths; bands are known by number only.",
