@@ -94,7 +94,7 @@ def test_radiance_with_a_white_of_radiance_is_reflectance(tmp_path: Path) -> Non
 
 
 def test_percent_that_is_called_reflectance_is_said_in_envi(tmp_path: Path) -> None:
-    said = {"z_plot_titles": "{Wavelength, Reflectance (%)}"}
+    said: dict[str, Any] = {"z_plot_titles": "{Wavelength, Reflectance (%)}"}
     cube = open_cube(write_envi(tmp_path / "x.hdr", scene() * 100, **said))
     assert cube.quantity == "counts"
     assert "reflectance_implausible" in codes(cube)
@@ -115,10 +115,12 @@ def test_reflectance_gains_come_before_those_of_radiance(tmp_path: Path) -> None
 @pytest.mark.parametrize("field", ["major frame offsets", "minor frame offsets"])
 def test_bytes_between_lines_are_refused(tmp_path: Path, field: str) -> None:
     key = field.replace(" ", "_")
+    offset: dict[str, Any] = {key: "{0, 16}"}
+    none: dict[str, Any] = {key: "{0, 0}"}
     with pytest.raises(CubeHeaderError) as caught:
-        open_cube(write_envi(tmp_path / "x.hdr", scene(), **{key: "{0, 16}"}))
+        open_cube(write_envi(tmp_path / "x.hdr", scene(), **offset))
     assert caught.value.details["field"] == field
-    assert open_cube(write_envi(tmp_path / "y.hdr", scene(), **{key: "{0, 0}"})).pixels.shape == SHAPE
+    assert open_cube(write_envi(tmp_path / "y.hdr", scene(), **none)).pixels.shape == SHAPE
 
 
 @pytest.mark.parametrize("fill", [1e-6, 1e-4])
