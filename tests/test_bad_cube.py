@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from scenes import Finished, OnDisk, cube_with, run_refused, tree_of, xyz_image
 
+from specimap.core.cube import open_cube
 from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline
 from specimap.core.report import Report
 
@@ -160,3 +161,20 @@ def test_a_marker_hidden_in_the_cube(small: OnDisk, finished: Finished, tmp_path
     assert refusal["code"] == "markers_missing_in_cube"
     assert refusal["details"] == {"seen": [2], "wanted": [0, 1, 2, 3]}
     assert tree_of(out) == before
+
+
+def test_what_the_reader_assumed_is_said_where_no_marker_shows(
+    small: OnDisk, finished: Finished, tmp_path: Path
+) -> None:
+    """Bands first, in a format that has no names for axes: recording it again would not help."""
+    values = open_cube(small.header).read_rows(0, 128)
+    np.save(tmp_path / "bands_first.npy", values.transpose(2, 0, 1))
+    out = finished.copy_to(tmp_path / "out")
+    error = run_refused(small.photos, tmp_path / "bands_first.npy", out)
+    assert error["code"] == "markers_missing_in_cube"
+    assert f"taken as {values.shape[2]} rows x {values.shape[0]} columns" in str(error["message"])
+    assert str(error["advice"]).startswith("First check that")
+    upside_down = header_edited(small, tmp_path / "order", "byte order = 0", "byte order = 1")
+    plain = run_refused(small.photos, upside_down, out)
+    assert plain["code"] == "markers_missing_in_cube"
+    assert str(plain["advice"]).startswith("Record the cube again")

@@ -76,3 +76,43 @@ def test_references_that_do_not_fit(tmp_path: Path) -> None:
         assert caught.value.details["reference"] == "white"
     with pytest.raises(SettingsError):
         open_cube(raw, dark=dark_path)
+
+
+def test_dropped_frames_have_no_reflectance(tmp_path: Path) -> None:
+    """Zeros in all bands lie below any dark signal: nothing was recorded, and nothing was dark."""
+    white, dark, white_path, dark_path = references(tmp_path)
+    truth = np.random.default_rng(4).uniform(0.1, 0.9, (7, 5, 11))
+    raw = np.round(dark + truth * (white - dark)).astype("u2")
+    raw[[2, 5]] = 0
+    raw[3, 1, 4] = 0  # one element alone is a value
+    cube = open_cube(write_envi(tmp_path / "raw.hdr", raw, "bil"), white=white_path, dark=dark_path)
+    got = cube.read_rows(0, 7)
+    assert np.isnan(got[[2, 5]]).all()
+    assert np.isfinite(np.delete(got, [2, 5], 0)).all()
+    np.testing.assert_array_equal(cube.band(4), got[..., 4])
+    assert np.isnan(cube.mean_image()).sum() == 10
+
+
+@pytest.mark.parametrize(("share", "said"), [(1.0, False), (0.5, False), (0.1, True)])
+def test_a_white_of_another_exposure_is_noticed(tmp_path: Path, share: float, said: bool) -> None:
+    rng = np.random.default_rng(6)
+    white = rng.uniform(3000, 3100, (1, 40, 6))
+    raw = write_envi(tmp_path / "raw.hdr", np.rint(rng.uniform(0.1, 0.9, (30, 40, 6)) * white).astype("u2"))
+    reference = write_envi(tmp_path / "w.hdr", np.rint(white * share).astype("u2"))
+    cube = open_cube(raw, white=reference)
+    assert ("reflectance_implausible" in dict(cube.warnings)) == said
+
+
+@pytest.mark.parametrize(
+    ("of_white", "of_raw", "said"),
+    [("9.96", "9.96", False), ("10.0", "9.96", False), ("2.0", "10.0", True), ("2 ms", "10 ms", True),
+     ("", "10", False), ("{1, 2}", "10", False), ("0", "10", False), ("auto", "10", False)],
+)  # fmt: skip
+def test_an_exposure_that_differs_is_said(tmp_path: Path, of_white: str, of_raw: str, said: bool) -> None:
+    values = random_values("u2", (4, 5, 11)) // 20 + 100
+    raw = write_envi(tmp_path / "raw.hdr", values, tint=of_raw)
+    dark = write_envi(tmp_path / "dark.hdr", np.full_like(values, 90), tint=of_raw)
+    cube = open_cube(raw, white=write_envi(tmp_path / "w.hdr", values[:1] + 50, tint=of_white), dark=dark)
+    told = dict(cube.warnings).get("reference_exposure_differs", "")
+    assert bool(told) == said
+    assert not said or "white reference was exposed 0.2 times as long" in told

@@ -7,6 +7,7 @@ references are averaged over their rows.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from specimap.core.cube.model import Cube
 from specimap.core.cube.pixels import Pixels
 from specimap.core.cube.strided import to_bip
+from specimap.core.cube.values import QUANTITY_OTHER, implausible, sampled
 from specimap.core.cube.wavelengths import Warnings
 from specimap.core.errors import CubeContentError
 from specimap.core.geometry import Array, Floats
@@ -22,13 +24,17 @@ from specimap.core.geometry import Array, Floats
 _LEAST_CLIPPED_WHITE = 0.002
 # Wider apart than a band of any imager: the reference was taken with other settings.
 _WAVELENGTH_TOLERANCE_NM = 1.0
+_EXPOSURE_TOLERANCE = 0.01
+# A spectrum of fewer bands may well be zero in all.
+_LEAST_BANDS = 3
 
 
 def calibrated(raw: Cube, white: Cube, dark: Cube | None) -> Cube:
     """The cube of reflectance (float32) of a raw cube. Without a dark reference, 0 counts are taken as dark.
 
-    Where the white is not brighter than the dark, or a reference has no value, reflectance is NaN. Saturation stays
-    that of the raw counts. Raises CubeContentError for a reference whose columns or bands do not fit.
+    Where the white is not brighter than the dark, a reference has no value, or the raw cube holds zeros in all bands,
+    reflectance is NaN. Saturation stays that of the raw counts. Raises CubeContentError for a reference whose columns
+    or bands do not fit.
     """
     warnings: Warnings = _fit(raw, white, "white") + (_fit(raw, dark, "dark") if dark else ())
     scales, about_units = _to_common_units(raw, white, dark)
@@ -57,6 +63,8 @@ def calibrated(raw: Cube, white: Cube, dark: Cube | None) -> Cube:
         np.broadcast_to(dark_line, span.shape).astype(np.float32),
         gain.astype(np.float32),
     )
+    about_raw = tuple(w for w in raw.warnings if w[0] != QUANTITY_OTHER)
+    warnings += implausible(sampled(pixels)[..., ~raw.bad_bands], calibrated=True)
     level = None if raw.saturation is None else pixels.calibrated(raw.saturation.astype(np.float32))
     return replace(
         raw,
@@ -65,7 +73,7 @@ def calibrated(raw: Cube, white: Cube, dark: Cube | None) -> Cube:
         quantity="reflectance",
         to_reflectance=1.0,
         saturation=None if level is None else level.astype(np.float64),
-        warnings=raw.warnings + warnings,
+        warnings=about_raw + warnings,
     )
 
 
@@ -79,11 +87,18 @@ def _fit(raw: Cube, reference: Cube, name: str) -> Warnings:
             expected=[raw.cols, raw.bands],
             found=[reference.cols, reference.bands],
         )
+    warnings: Warnings = ()
+    if raw.exposure and reference.exposure and abs(reference.exposure / raw.exposure - 1) > _EXPOSURE_TOLERANCE:
+        text = (
+            f"The {name} reference was exposed {reference.exposure / raw.exposure:.3g} times as long as the cube, as "
+            "their files say; values are used as they stand."
+        )
+        warnings = (("reference_exposure_differs", text),)
     apart = np.abs(reference.wavelengths_nm - raw.wavelengths_nm)
     if (apart > _WAVELENGTH_TOLERANCE_NM).any():  # NaN, where either names none, does not count
         text = f"The {name} reference's wavelengths are up to {np.nanmax(apart):.1f} nm off the cube's."
-        return ((f"{name}_wavelengths_differ", text),)
-    return ()
+        warnings += ((f"{name}_wavelengths_differ", text),)
+    return warnings
 
 
 def _to_common_units(raw: Cube, white: Cube, dark: Cube | None) -> tuple[tuple[float, float], Warnings]:
@@ -130,7 +145,10 @@ class _CalibratedPixels(Pixels):
         self._raw, self._dark, self._gain = raw, dark, gain
 
     def block(self, start: int, stop: int) -> Array:
-        return self.calibrated(to_bip(self._raw.block(start, stop)))
+        raw = to_bip(self._raw.block(start, stop))
+        out = self.calibrated(raw)
+        out[_unrecorded(raw)] = np.nan
+        return out
 
     def calibrated(self, raw: Array) -> Array:
         """Raw values, of a shape that broadcasts to (cols, bands), as reflectance."""
@@ -142,8 +160,26 @@ class _CalibratedPixels(Pixels):
         values = self._raw.band(index).astype(np.float32)
         values -= self._dark[:, index]
         values *= self._gain[:, index]
+        values[self._without_record] = np.nan
         return values
+
+    @cached_property
+    def _without_record(self) -> NDArray[np.bool_]:
+        step = self.strip_rows()
+        starts = range(0, self.shape[0], step)
+        return np.concatenate([_unrecorded(to_bip(self._raw.block(s, min(s + step, self.shape[0])))) for s in starts])
 
     def strip_rows(self) -> int:
         # A quarter: raw values, differences and products of a strip are alive at once.
         return max(1, super().strip_rows() // 4)
+
+
+def _unrecorded(raw: Array) -> NDArray[np.bool_]:
+    """Which pixels (n, cols) of a block hold zeros in all bands, as dropped frames do: a dark signal is above zero."""
+    bands = raw.shape[2]
+    # One band tells for nearly all of them.
+    found = np.asarray(raw[..., bands // 2] == 0)
+    if bands < _LEAST_BANDS:
+        return np.zeros_like(found)
+    found[found] = ~raw[found].any(-1)
+    return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,14 +20,28 @@ _CF_SCALE = "scale_factor"
 _GAINS = ("scalefactor", "datagainvalues")
 _OFFSETS = ("addoffset", "dataoffsetvalues")
 _DIVISOR = "reflectancescalefactor"
+# ENVI's words for what makes reflectance; the plain ones beside them make radiance.
+_REFLECTANCE_GAINS = ("datareflectancegainvalues",)
+_REFLECTANCE_OFFSETS = ("datareflectanceoffsetvalues",)
 _CEILING = ("ceiling", "saturationlevel", "saturationvalue")
 _BITS = "bitdepth"
 _VALID = ("validmin", "validmax", "validrange")
 _UNSIGNED = "unsigned"
-WORDS = frozenset((*_NO_DATA, *_GAINS, *_OFFSETS, _DIVISOR, *_CEILING, _BITS, *_VALID))
+_EXPOSURE = ("tint", "integrationtime", "exposuretime", "exposure")
+WORDS = frozenset((
+    *_NO_DATA, *_GAINS, *_OFFSETS, *_REFLECTANCE_GAINS, *_REFLECTANCE_OFFSETS, _DIVISOR, *_CEILING, _BITS, *_VALID,
+    *_EXPOSURE,
+))  # fmt: skip
 """What the names of attributes and variables are compared with, see :func:`plain`."""
+# What other quantities are called, or their units, in which values may lie between 0 and 1 as well.
+_OTHER_QUANTITY = re.compile(
+    r"(?P<name>(ir)?radiance|absorbance|absorption|transmittance|transmission|emissivity|fluorescence)|"
+    r"[\s/*(.]sr\b|\bsr\^?-1|\b[mu\u00b5]?w[\s/*.]*\(?c?m\^?-?2",
+    re.IGNORECASE,
+)
 _NOTHING = ("", "none", "null", "na", "n/a")
 _LONGEST = 100_000
+_LEADING_NUMBER = re.compile(r"\s*[0-9]*\.?[0-9]+(e[+-]?[0-9]+)?(?=\s*[a-zµ]*\s*$)", re.IGNORECASE)
 _SEPARATORS = re.compile(r"[\s,{}\[\]()]+")
 
 
@@ -39,6 +53,7 @@ class Declared:
     none. ``gains``, ``offsets`` (1,) or (B,): stored * gain + offset is the value; ``divisor``: the value by it is
     reflectance. ``names`` of the fields that gave them, for messages. ``ceiling``: the stored value at which the
     sensor clips. ``unsigned``: integers are to be read without sign. ``reflectance``: the file calls its values so.
+    ``other``: what it calls them instead, such as radiance. ``exposure``: of a line, in the file's own unit.
     """
 
     no_data: tuple[float, ...] = ()
@@ -49,6 +64,8 @@ class Declared:
     ceiling: float | None = None
     unsigned: bool = False
     reflectance: bool = False
+    other: str | None = None
+    exposure: float | None = None
     names: Mapping[str, str] | None = None
     warnings: Warnings = ()
 
@@ -62,21 +79,30 @@ def plain(name: str) -> str:
     return re.sub(r"[\s_\-]", "", name).lower()
 
 
-def declared_of(file_name: str, attributes: Mapping[str, object], *titles: str | None) -> Declared:
+def declared_of(
+    file_name: str, attributes: Mapping[str, object], *titles: str | None, remarks: str | None = None
+) -> Declared:
     """What the attributes of a data set, the fields of a header, or small variables beside an array declare.
 
     ``scale_factor`` and ``add_offset`` are CF's: stored * scale_factor + add_offset. Spelt otherwise
     (``Scale_Factor``, as NEON does), or of a data set that calls itself reflectance, a factor of more than 1 is
-    what values are divided by. ``titles``: names that may call the values reflectance.
+    what values are divided by. ``titles``: names and units that may call the values reflectance, or something else.
+    ``remarks``: free text, which is believed only where it speaks of something else and not of reflectance.
 
     Raises CubeHeaderError, whose ``details['field']`` names the attribute, for what is not a number, not finite, or
     a factor of zero.
     """
     found = {plain(name): (name, value) for name, value in attributes.items()}
     named = any("reflect" in (title or "").lower() for title in titles)
+    other = None if named else _other_quantity(titles, remarks)
     reader = _Reader(file_name, found)
     names: dict[str, str] = {}
-    scale, offsets = reader.first(_GAINS, names, "gains"), reader.first(_OFFSETS, names, "offsets")
+    scale = reader.first(_REFLECTANCE_GAINS, names, "gains")
+    if scale is not None:
+        named, other = True, None
+        offsets = reader.first(_REFLECTANCE_OFFSETS, names, "offsets")
+    else:
+        scale, offsets = reader.first(_GAINS, names, "gains"), reader.first(_OFFSETS, names, "offsets")
     divisor = reader.first((_DIVISOR,), names, "divisor")
     _check_factor(file_name, names.get("divisor"), divisor, positive=True)
     _check_factor(file_name, names.get("gains"), scale, positive=False)
@@ -100,9 +126,22 @@ def declared_of(file_name: str, attributes: Mapping[str, object], *titles: str |
         ceiling=reader.ceiling(),
         unsigned=_UNSIGNED in found and str(_text(found[_UNSIGNED][1])).lower() == "true",
         reflectance=named or divisor is not None,
+        other=other,
+        exposure=reader.exposure(),
         names=names,
         warnings=warnings,
     )
+
+
+def _other_quantity(titles: Sequence[str | None], remarks: str | None) -> str | None:
+    """What names or units call the values, where that is not reflectance; None where nothing is said."""
+    told = [title for title in titles if title]
+    if remarks and "reflect" not in remarks.lower():
+        told.append(remarks)
+    for text in told:
+        if (found := _OTHER_QUANTITY.search(text)) is not None:
+            return (found["name"] or "radiance").lower()
+    return None
 
 
 def is_word(name: str, shape: tuple[int, ...]) -> bool:
@@ -207,6 +246,14 @@ class _Reader:
         if low is None and high is None:
             return None
         return (-np.inf if low is None else float(low[0]), np.inf if high is None else float(high[0]))
+
+    def exposure(self) -> float | None:
+        """Of several words the first that is one positive number, which may carry its unit (``10 ms``)."""
+        for key in _EXPOSURE:
+            found = _LEADING_NUMBER.match(str(_text(self._found[key][1]))) if key in self._found else None
+            if found is not None and np.isfinite(value := float(found[0])) and value > 0:
+                return value
+        return None
 
     def ceiling(self) -> float | None:
         for key in _CEILING:

@@ -169,6 +169,7 @@ class _Reader:
 
     def header(self) -> EnviHeader:
         self._check_file_type()
+        self._check_frames()
         cols, rows, bands = (self._whole(key, 1, _LARGEST_SIDE) for key in ("samples", "lines", "bands"))
         dtype = self._dtype()
         sides = {"samples": cols, "lines": rows, "bands": bands}
@@ -238,6 +239,13 @@ class _Reader:
         if any(word in kind for word in _OTHER_FILE_TYPES):
             raise self._wrong("file type", "is not a plain cube of spectra")
 
+    def _check_frames(self) -> None:
+        """Values alone may stand in the data: bytes between lines or bands would be read as values."""
+        for field in ("major frame offsets", "minor frame offsets"):
+            found = self._numbers(field)
+            if found is not None and found.any():
+                raise self._wrong(field, "puts other bytes between the values, which is not read")
+
     def _numbers(self, field: str) -> Floats | None:
         text = self._fields.get(field)
         if text is None:
@@ -258,6 +266,8 @@ class _Reader:
 
     def _declared(self, bands: int) -> Declared:
         fields = {key: value.partition(";")[0] for key, value in self._fields.items() if plain(key) in WORDS}
-        declared = declared_of(self._name, fields)
+        # Of a plot's titles the second is the values' own.
+        title, remarks = self._fields.get("z plot titles", "").partition(",")[2], self._fields.get("description")
+        declared = declared_of(self._name, fields, title, remarks=remarks)
         check_counts(self._name, declared, bands)
         return declared

@@ -167,7 +167,8 @@ def _declared(path: Path, file: h5py.File, dataset: h5py.Dataset) -> Declared:
             if isinstance(node, h5py.Dataset) and node.shape is not None and is_word(name, node.shape):
                 said[name] = guarded_dataset(path, file, node.name)[()]
     said |= {name: value for name, value in _attributes(dataset) if plain(name) in (*WORDS, "unsigned")}
-    titles = (_text(value) for name, value in _attributes(dataset) if name in ("long_name", "standard_name"))
+    named = ("long_name", "standard_name", "units", "unit")
+    titles = (_text(value) for name, value in _attributes(dataset) if name.lower() in named)
     return declared_of(path.name, said, str(dataset.name), *titles)
 
 

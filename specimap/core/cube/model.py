@@ -31,7 +31,8 @@ class Cube:
 
     ``wavelengths_nm`` (B,) is NaN where the file names none; ``bad_bands`` (B,). ``to_reflectance`` times a value is
     reflectance; None where the values are counts. ``saturation``: the value from which on a band counts as saturated,
-    (), (B,) or (cols, B), NaN or None where that is unknown. ``warnings`` are (code, sentence). ``files`` are those
+    (), (B,) or (cols, B), NaN or None where that is unknown. ``exposure``: how long a line was exposed, in the file's
+    own unit, None where it does not say. ``warnings`` are (code, sentence). ``files`` are those
     whose content makes the cube, ``datasets`` what was asked for by name in them.
     """
 
@@ -46,6 +47,7 @@ class Cube:
     saturation: Floats | None = field(repr=False)
     warnings: Warnings
     datasets: tuple[str | None, ...] = ()
+    exposure: float | None = None
 
     @property
     def rows(self) -> int:
@@ -169,6 +171,7 @@ def describe(
         to_reflectance=meaning.to_reflectance,
         saturation=meaning.saturation,
         warnings=warnings + about_wavelengths + about_bands + meaning.warnings,
+        exposure=None if declared is None else declared.exposure,
     )
 
 

@@ -55,7 +55,8 @@ class NetCdf3Format:
 
 def _declared(path: Path, name: str, attributes: Mapping[str, object]) -> Declared:
     texts = {key: value.decode("utf-8", "replace") for key, value in attributes.items() if isinstance(value, bytes)}
-    return declared_of(path.name, {**attributes, **texts}, name, texts.get("long_name"), texts.get("standard_name"))
+    titles = (texts.get(title) for title in ("long_name", "standard_name", "units"))
+    return declared_of(path.name, {**attributes, **texts}, name, *titles)
 
 
 def _units(variable: object) -> str | None:

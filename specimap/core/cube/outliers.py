@@ -67,6 +67,8 @@ def _upper_bound(positive: Array) -> float:
     for below, above in itertools.pairwise(filled.tolist()):
         if above - below > _GAP:
             limit = float(2.0 ** (below + least + 1))
+            if float(np.ptp(positive[positive <= limit])) == 0:  # what fills a masked background, and no scene
+                continue
             beyond = positive[positive > limit]
             copies = above - below > 2 * _GAP and beyond.size > 1 and float(np.ptp(beyond)) == 0
             if copies or beyond.size < _MOST_BEYOND * positive.size:
@@ -118,6 +120,8 @@ def clip_level(values: Array, dtype: np.dtype, ceiling: float | None) -> float |
     levels: list[float] = []
     finite = values[np.isfinite(values)]
     whole = dtype.kind in "iu"
+    if not whole and finite.size and float(np.ptp(finite)) == 0:  # an ideal white frame, which no sensor recorded
+        finite = finite[:0]
     if whole:
         levels.append(float(np.iinfo(dtype).max))
         finite = finite[finite < levels[0]]

@@ -21,6 +21,7 @@ from specimap.core.cube.wavelengths import Warnings
 from specimap.core.geometry import Array, Floats
 
 Quantity = Literal["reflectance", "counts"]
+QUANTITY_OTHER = "quantity_not_reflectance"
 
 # Reflectance of wet tissue and of references lies in 0 to 1; noise and glints reach a little beyond.
 _REFLECTANCE_RANGE = (-0.1, 2.0)
@@ -51,7 +52,7 @@ def settle(file_name: str, stored: Pixels, bad_bands: NDArray[np.bool_], declare
     offsets = _per_band(declared.offsets, bands, idle=0.0)
     unsigned = declared.unsigned and stored.dtype.kind == "i"
     dtype = np.dtype(stored.dtype.str.replace("i", "u")) if unsigned else stored.dtype
-    raw = _sample(stored)
+    raw = sampled(stored)
     raw = as_unsigned(raw) if unsigned else raw
     missing, values, about_missing = _missing(raw, dtype, declared)
     good = ~bad_bands
@@ -62,7 +63,11 @@ def settle(file_name: str, stored: Pixels, bad_bands: NDArray[np.bool_], declare
         meant = meant * (1.0 if gains is None else gains[good]) + (0.0 if offsets is None else offsets[good])
     real = dtype.kind == "f" or gains is not None or offsets is not None
     to_reflectance, about_scale = _to_reflectance(meant, declared, real=real)
-    warnings = declared.warnings + about_missing + about_scale + _plausible(meant, to_reflectance, declared, real=real)
+    warnings = declared.warnings + about_missing + about_scale
+    if to_reflectance is not None:
+        warnings += implausible(meant * to_reflectance)
+    elif real and declared.reflectance:
+        warnings += _percent(meant)
     # One factor for all bands need not touch the values: integers are copied as they are.
     uniform = gains is not None and offsets is None and bool((gains == gains[0]).all()) and gains[0] > 0
     if uniform and gains is not None and to_reflectance is not None:
@@ -86,7 +91,7 @@ def _per_band(numbers: Floats | None, bands: int, *, idle: float) -> Floats | No
     return np.broadcast_to(numbers, (bands,)).astype(np.float64)
 
 
-def _sample(pixels: Pixels) -> Array:
+def sampled(pixels: Pixels) -> Array:
     """Rows spread evenly over the cube, (n, cols, bands)."""
     rows, cols, bands = pixels.shape
     most = int(np.clip(_SAMPLED_VALUES // (cols * bands), 1, _SAMPLED_ROWS))
@@ -162,7 +167,11 @@ def _to_reflectance(meant: Array, declared: Declared, *, real: bool) -> tuple[fl
     """What turns values into reflectance; None where they are something else."""
     bright = _bright(meant)
     if declared.divisor is None:
-        return (1.0 if real and (_looks_like_reflectance(meant) or _called_so(meant, declared)) else None), ()
+        seems = real and (_looks_like_reflectance(meant) or _called_so(meant, declared))
+        if seems and declared.other is not None:
+            text = f"The file calls its values {declared.other}: they are kept as they stand, and not as reflectance."
+            return None, ((QUANTITY_OTHER, text),)
+        return (1.0 if seems else None), ()
     factor = declared.divisor
     if real and bright is not None and bright / factor < _LEAST_BRIGHT and _looks_like_reflectance(meant):
         text = f"'{declared.name('divisor')} = {factor:g}', but the values are reflectance already, up to {bright:.3g}"
@@ -191,25 +200,34 @@ def _looks_like_reflectance(values: Array) -> bool:
     return bool(low >= _REFLECTANCE_RANGE[0] and high <= _REFLECTANCE_RANGE[1])
 
 
-def _plausible(meant: Array, to_reflectance: float | None, declared: Declared, *, real: bool) -> Warnings:
-    """A warning where what is called reflectance cannot be."""
-    finite = meant[np.isfinite(meant)]
+def _percent(meant: Array) -> Warnings:
+    """A warning where what the file calls reflectance was not taken for it, and looks like percent."""
+    bright = _bright(meant)
+    if bright is None or not _REFLECTANCE_RANGE[1] < bright <= _MOST_PERCENT:
+        return ()
+    text = "The file calls its values reflectance, but they look like percent; they are kept as they stand."
+    return (("reflectance_implausible", text),)
+
+
+def implausible(reflectance: Array, *, calibrated: bool = False) -> Warnings:
+    """A warning where what is called reflectance, a sample of it in good bands, cannot be.
+
+    ``calibrated``: it was made of counts and references.
+    """
+    finite = reflectance[np.isfinite(reflectance)]
     if not finite.size or not finite.any():
         return ()
-    if to_reflectance is None:
-        if real and declared.reflectance and 2 < float(np.percentile(finite, 99.9)) <= _MOST_PERCENT:
-            text = "The file calls its values reflectance, but they look like percent; they are kept as they stand."
-            return (("reflectance_implausible", text),)
-        return ()
-    middle, bright = (float(v) * to_reflectance for v in np.percentile(finite, (50, 99.9)))
+    middle, bright = (float(v) for v in np.percentile(finite, (50, 99.9)))
     text = ""
     if bright <= 0:
         text = "Nothing reflects more than nothing: all values are zero or negative."
     elif bright < _LEAST_BRIGHT:
-        text = f"Nothing reflects more than {bright:.2g}: the reflectance scale factor seems too large."
+        text = f"Nothing reflects more than {bright:.2g}: the scale of the reflectance seems wrong."
     elif middle > _REFLECTANCE_RANGE[1]:
-        percent = " They may be percent." if bright <= _MOST_PERCENT else ""
-        text = f"Half of the cube reflects more than {middle:.3g}: the scale seems wrong.{percent}"
+        cause = " They may be percent." if bright <= _MOST_PERCENT else ""
+        if calibrated:
+            cause = " The white reference seems to be of a shorter exposure or less light."
+        text = f"Half of the cube reflects more than {middle:.3g}: the scale seems wrong.{cause}"
     elif middle < _REFLECTANCE_RANGE[0]:
         text = f"Half of the cube has a reflectance below {middle:.2g}: offset or dark reference seem wrong."
     return (("reflectance_implausible", text),) if text else ()

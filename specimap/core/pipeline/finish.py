@@ -16,6 +16,7 @@ from specimap.core.cloud import Cloud, CloudPoints, Flag
 from specimap.core.cloud.writer import write_cloud
 from specimap.core.cloud.written import Written
 from specimap.core.cube import Cube
+from specimap.core.errors import MarkersMissingInCubeError
 from specimap.core.files import write_text
 from specimap.core.gates import gated
 from specimap.core.geometry import Floats, Pose, View
@@ -26,7 +27,7 @@ from specimap.core.pipeline.artefacts import Stage1, Stage2
 from specimap.core.pipeline.clock import Clock
 from specimap.core.pipeline.corners import cube_corners, photo_corners
 from specimap.core.pipeline.outputs import Outputs, staged
-from specimap.core.pipeline.remarks import remarks_of
+from specimap.core.pipeline.remarks import remarks_of, with_assumptions
 from specimap.core.pipeline.settings import PipelineSettings
 from specimap.core.pipeline.stages import all_refused
 from specimap.core.points import cloud_points
@@ -115,7 +116,10 @@ def _register(
 ) -> tuple[CloudPoints, Report]:
     """Stage 4 up to the writing; what it needs on the way is gone by then."""
     adjusted, (coarse, fine) = stage2.adjusted, grids
-    found = find_markers(cube, settings.reconstruct.dictionary, adjusted.marker_ids)
+    try:
+        found = find_markers(cube, settings.reconstruct.dictionary, adjusted.marker_ids)
+    except MarkersMissingInCubeError as error:
+        raise with_assumptions(error, cube.warnings) from error
     progress(0.1)
     seen = corners_in_cube(found, adjusted, cube.cols)
     settled = settle_camera(seen, found, cube.rows, cube.cols, caster, adjusted.corners)

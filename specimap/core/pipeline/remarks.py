@@ -4,10 +4,30 @@ from __future__ import annotations
 
 from specimap.core.acquisition import RECOMMENDED_PHOTOS
 from specimap.core.adjust import Adjusted
+from specimap.core.cube.wavelengths import Warnings
+from specimap.core.errors import MarkersMissingInCubeError
 from specimap.core.layout import edge_lengths
 from specimap.core.pipeline.artefacts import Stage1
 from specimap.core.pipeline.scale import PLAUSIBLE_DISTANCE_MM, disagrees, likely_unit, reach_mm
 from specimap.core.register.cube_markers import CubeMarkers
+
+# What may have turned the cube's picture into another: axes, byte order, size and choice of the array.
+_ASSUMPTIONS = ("axes_assumed", "byte_order_assumed", "data_longer_than_header", "dataset_chosen")
+
+
+def with_assumptions(error: MarkersMissingInCubeError, warnings: Warnings) -> MarkersMissingInCubeError:
+    """The refusal with what the reader assumed about the file, which may be the reason; else as it is.
+
+    ``warnings`` are the cube's.
+    """
+    assumed = [text for code, text in warnings if code in _ASSUMPTIONS]
+    if not assumed:
+        return error
+    return MarkersMissingInCubeError(
+        " ".join([error.message, *assumed]),
+        advice=f"First check that, which makes another picture of the cube where it is wrong. Else: {error.advice}",
+        **error.details,
+    )
 
 
 def remarks_of(stage1: Stage1, adjusted: Adjusted, found: CubeMarkers) -> list[tuple[str, str]]:
