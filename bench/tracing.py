@@ -56,7 +56,7 @@ TARGETS = (
     Target("render", _STAGES, "render_grid"),
     Target("cube markers", _FINISH, "find_markers", splits=True),
     Target("registration", _FINISH, "_register"),
-    Target("motion check", "specimap.core.register.settle", "specimen_shift", splits=True),
+    Target("motion check", "specimap.core.register.settle", "choose_camera", splits=True),
     Target("mesh written", _FINISH, "write_mesh_ply"),
     Target("cloud written", _FINISH, "write_cloud"),
     Target("preview", _FINISH, "write_preview"),
