@@ -70,6 +70,7 @@ REFLECTANCE: dict[str, Callable[[Path], Path]] = {
     "ENVI, nothing said": lambda f: envi(f / "x.hdr"),
     "ENVI, description of both": lambda f: envi(f / "x.hdr", description="{Radiance to reflectance, empirical line}"),
     "ENVI, radiometric": lambda f: envi(f / "x.hdr", description="{Radiometrically corrected}"),
+    "ENVI, units in free text": lambda f: envi(f / "x.hdr", description="{lamp 3 mW/cm2, map in w/ m2}"),
     "ENVI, factor": lambda f: envi(f / "x.hdr", description="{Radiance}", reflectance_scale_factor=1),
     "HDF5": lambda f: hdf5(f / "x.h5", "surface_reflectance", units="1"),
     "HDF5, under radiance": lambda f: hdf5(f / "x.h5", "from_radiance/reflectance"),

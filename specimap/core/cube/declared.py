@@ -135,12 +135,12 @@ def declared_of(
 
 def _other_quantity(titles: Sequence[str | None], remarks: str | None) -> str | None:
     """What names or units call the values, where that is not reflectance; None where nothing is said."""
-    told = [title for title in titles if title]
-    if remarks and "reflect" not in remarks.lower():
-        told.append(remarks)
-    for text in told:
-        if (found := _OTHER_QUANTITY.search(text)) is not None:
+    for title in titles:
+        if (found := _OTHER_QUANTITY.search(title or "")) is not None:
             return (found["name"] or "radiance").lower()
+    if remarks and "reflect" not in remarks.lower():
+        # A unit in free text may be of anything.
+        return next((m["name"].lower() for m in _OTHER_QUANTITY.finditer(remarks) if m["name"]), None)
     return None
 
 
