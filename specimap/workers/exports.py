@@ -215,8 +215,8 @@ def _run_once(
         str(os.getpid()), str(settings.stage_memory_bytes),
     ]  # fmt: skip
     with tempfile.TemporaryFile(dir=cell.folder) as answer, tempfile.TemporaryFile(dir=cell.folder) as said:
-        # A session of its own: a kill reaches whatever it starts, and the terminal's signals do not reach it. Nothing of
-        # the worker's is handed down: who holds the file of its log could empty it.
+        # A session of its own: a kill reaches whatever it starts, and the terminal's signals do not reach it. It holds
+        # no file of the worker's: it could empty that of the log.
         process = subprocess.Popen(
             cells.confined(command, cell, backends=False), stdin=subprocess.DEVNULL, stdout=answer, stderr=said,
             start_new_session=True, env=cells.environment(cell),

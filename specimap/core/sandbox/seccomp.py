@@ -126,7 +126,7 @@ def _program(alone: bool) -> list[Instruction]:
     # An address of a datagram: none is given by send(2).
     for half in (_low(4), _low(4) + 4):
         when(_SENDTO[column], ((_LOAD, 0, 0, half), (_EQUAL, 1, 0, 0)))
-    # A pair of streams leads nowhere else. One of datagrams, which Linux makes of raw sockets too, sends to any address.
+    # A pair of streams leads nowhere else; one of datagrams, which a raw one is too, sends to any address.
     when(_SOCKETPAIR[column], ((_LOAD, 0, 0, _low(0)), (_EQUAL, 1, 0, _UNIX)))
     when(_SOCKETPAIR[column], ((_LOAD, 0, 0, _low(1)), (_AND, 0, 0, 0xF), (_EQUAL, 1, 0, _STREAM)))
     # The processors of another process; its own threads it may bind by the number that means the caller.
