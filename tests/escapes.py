@@ -20,7 +20,7 @@ from typing import Any
 
 LIBRARY = ctypes.CDLL(None, use_errno=True)
 PROCESS_VM_READV = 310 if os.uname().machine == "x86_64" else 270
-PIDFD_OPEN, IO_URING_SETUP, PTRACE_SEIZE = 434, 425, 0x4206
+PIDFD_OPEN, IO_URING_SETUP, FILE_SETATTR, PTRACE_SEIZE = 434, 425, 469, 0x4206
 
 
 def _called(answer: int) -> None:
@@ -62,6 +62,30 @@ def _pair_turned(address: str) -> None:
     one, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     with one, other:
         one.sendto(b"x", address)
+
+
+def _pair_of(kind: int, address: str) -> None:
+    one, other = socket.socketpair(socket.AF_UNIX, kind)
+    with one, other:
+        one.sendmsg([b"x"], [], 0, address)
+
+
+def _with_open(path: Path, change: Callable[[int], object]) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        change(handle)
+    finally:
+        os.close(handle)
+
+
+def _queued(queue: int) -> None:
+    message = struct.pack("l", 1) + b"x"
+    _called(LIBRARY.msgsnd(queue, message, 1, os.O_NONBLOCK))
+
+
+def _attributes_set(path: str) -> None:
+    # 24 bytes of zeros stand for none of them.
+    _called(LIBRARY.syscall(FILE_SETATTR, -100, path.encode(), ctypes.create_string_buffer(24), 24, 0))
 
 
 def _bound() -> None:
@@ -111,10 +135,11 @@ def _ran(*command: str) -> None:
 
 def ways(told: dict[str, Any]) -> dict[str, Callable[[], object]]:
     """``told``: secret, elsewhere (a folder), database, parent (process id), tcp and udp (ports), unix (a socket's
-    path), abstract (its name), own (a folder to write), link (a symbolic link to the secret that the reader was given).
+    path), abstract (its name), datagrams (another's path), queue (number of a System V message queue), own (a folder to
+    write), link (a symbolic link to the secret that the reader was given), with a file ``plain`` beside it.
     """
     secret, elsewhere, parent = told["secret"], Path(told["elsewhere"]), told["parent"]
-    own = Path(told["own"])
+    own, plain = Path(told["own"]), Path(told["link"]).with_name("plain")
     stream, datagram = socket.SOCK_STREAM, socket.SOCK_DGRAM
     return {
         "read a file of the same user": lambda: _bytes(secret),
@@ -143,6 +168,7 @@ def ways(told: dict[str, Any]) -> dict[str, Callable[[], object]]:
         "connect to a UNIX socket": lambda: _connected(socket.AF_UNIX, stream, told["unix"]),
         "connect to an abstract socket": lambda: _connected(socket.AF_UNIX, stream, told["abstract"]),
         "turn a pair of sockets": lambda: _pair_turned(told["datagrams"]),
+        "send from a raw pair": lambda: _pair_of(socket.SOCK_RAW, told["datagrams"]),
         "listen": _bound,
         "use io_uring": lambda: _called(LIBRARY.syscall(IO_URING_SETUP, 4, ctypes.create_string_buffer(248))),
         "make a file elsewhere": lambda: (elsewhere / "made").write_text("x"),
@@ -155,8 +181,15 @@ def ways(told: dict[str, Any]) -> dict[str, Callable[[], object]]:
         "open a file to all": lambda: os.chmod(secret, 0o644),
         "change a file's time": lambda: os.utime(secret, (1, 1)),
         "change a file's owner": lambda: os.chown(secret, os.getuid(), os.getgid()),
+        "change the rights of an open file": lambda: _with_open(plain, lambda f: os.fchmod(f, 0o644)),
+        "change the owner of an open file": lambda: _with_open(plain, lambda f: os.fchown(f, os.getuid(), os.getgid())),
+        "change the times of an open file": lambda: _with_open(plain, lambda f: os.utime(f, (1, 1))),
+        "change the attributes of an open file": lambda: _with_open(plain, lambda f: os.setxattr(f, "user.x", b"x")),
+        "change a file's attributes": lambda: _attributes_set(secret),
         "be another user": _as_another,
         "make a device": lambda: os.mknod(own / "zero", 0o600 | stat.S_IFCHR, os.makedev(1, 5)),
+        "move the parent to other processors": lambda: os.sched_setaffinity(parent, os.sched_getaffinity(parent)),
+        "send to a queue": lambda: _queued(told["queue"]),
         "share memory": lambda: _called(LIBRARY.shmget(0x5EC1, 4096, 0o1600)),
         "make a namespace": lambda: _called(LIBRARY.unshare(0x10000000)),
     }  # fmt: skip

@@ -23,6 +23,7 @@ from specimap.infra.settings import ServiceSettings, load_settings
 from specimap.infra.storage import Storage
 from specimap.service.app import create_app
 from specimap.service.auth import new_key
+from specimap.service.connections import Connection
 
 ALL_SCOPES = ("upload", "read", "label", "admin")
 
@@ -78,7 +79,9 @@ def serving(folder: Path, **given: object) -> Iterator[Running]:
     database.close()
     app = create_app(settings)
     server = uvicorn.Server(
-        uvicorn.Config(app, host="127.0.0.1", port=0, log_config=None, access_log=False, ws="none", lifespan="on")
+        uvicorn.Config(
+            app, host="127.0.0.1", port=0, log_config=None, access_log=False, ws="none", lifespan="on", http=Connection
+        )
     )
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()

@@ -21,6 +21,7 @@ from specimap.core.errors import SettingsError
 from specimap.core.reconstruct.learned.environment import BACKEND_VARIABLES
 from specimap.core.sandbox import Mode, Protection, Reach, confined, program_rules, protection
 from specimap.core.sandbox.launch import NOT_CONFINED
+from specimap.core.sandbox.places import interpreter_places
 from specimap.infra import confinement
 from specimap.infra.confinement import check_confinement
 from specimap.infra.settings import load_settings
@@ -88,16 +89,21 @@ def told(tmp_path: Path) -> Iterator[dict[str, Any]]:
         name = f"\0specimap-{os.getpid()}-{tmp_path.name}"
         abstract.bind(name)
         abstract.listen()
+        queue = escapes.LIBRARY.msgget(0, 0o600)
         yield {
             "secret": str(elsewhere / "secret"), "elsewhere": str(elsewhere), "database": str(database),
             "parent": os.getpid(), "tcp": tcp.getsockname()[1], "udp": udp.getsockname()[1],
-            "unix": str(tmp_path / "s"), "abstract": name, "datagrams": str(tmp_path / "d"),
+            "unix": str(tmp_path / "s"), "abstract": name, "datagrams": str(tmp_path / "d"), "queue": queue,
         }  # fmt: skip
+        escapes.LIBRARY.msgctl(queue, 0, None)
 
 
 def linked(folder: Path, told: dict[str, Any]) -> Path:
     link = folder / "link"
     link.symlink_to(told["secret"])
+    plain = folder / "plain"
+    plain.write_text("given")
+    plain.chmod(0o600)
     return link
 
 
@@ -162,7 +168,7 @@ KINDS = {"judging": in_judging, "stage": in_stage, "export": in_export}
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_way_leads_out(kind: str, told: dict[str, Any], tmp_path: Path) -> None:
     found = KINDS[kind](told, tmp_path / "own", "require")
-    assert len(found) == len(escapes.ways({**told, "own": ".", "link": ""}))
+    assert len(found) == len(escapes.ways({**told, "own": ".", "link": "link"}))
     assert {name: how for name, how in found.items() if how == "out"} == {}
     # What stops them is the confinement, not a mistake of the test.
     mistakes = ("TypeError", "NameError", "AttributeError", "FileNotFoundError")
@@ -177,7 +183,7 @@ def test_they_lead_out_where_nothing_is_confined(kind: str, told: dict[str, Any]
     moody = {
         "use io_uring", "trace the parent", "read the parent's memory", "open the parent's memory", "read a disk",
         "read /etc/shadow", "list the parent's open files", "make a namespace", "read it by the parent's root",
-        "be another user", "make a device",
+        "be another user", "make a device", "change the attributes of an open file", "change a file's attributes",
     }  # fmt: skip
     assert {name: how for name, how in found.items() if how != "out" and name not in moody} == {}
 
@@ -284,6 +290,17 @@ def test_no_rule_covers_a_private_place(tmp_path: Path, monkeypatch: pytest.Monk
     assert not {str(beside), str(beside / "data")} & set(named)
     monkeypatch.chdir(tmp_path / "plain")
     assert str(tmp_path / "plain") not in [place for place, _ in program_rules(Reach())]
+
+
+def test_an_interpreter_in_a_home_folder_opens_no_more_than_itself(tmp_path: Path) -> None:
+    home, own = tmp_path / "home", tmp_path / "venv"
+    for folder in (home, own):
+        (folder / "bin").mkdir(parents=True)
+        (folder / "bin" / "python").symlink_to(sys.executable)
+    (own / "pyvenv.cfg").write_text("home = /usr/bin\n")
+    assert home not in (found := list(interpreter_places(str(home / "bin" / "python"))))
+    assert home / "bin" / "python" in found
+    assert own in interpreter_places(str(own / "bin" / "python"))
 
 
 def test_a_command_that_cannot_be_confined_is_not_run(tmp_path: Path) -> None:

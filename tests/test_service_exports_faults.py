@@ -239,3 +239,38 @@ def test_the_process_does_nothing_for_a_worker_that_has_gone(result: Result, tmp
     command = [sys.executable, "-m", "specimap.workers.export_main", str(result.local), "ply", str(target), "1", "0"]
     assert subprocess.run(command, timeout=60).returncode == 1
     assert not target.exists()
+
+
+def test_the_process_holds_nothing_of_the_worker(
+    service: Running, client: httpx.Client, result: Result, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Its log, above all: a file that the worker writes could be emptied, a terminal read."""
+    told = tmp_path / "told"
+    script = tmp_path / "taken.py"
+    script.write_text(
+        "import os, pathlib, sys\n"
+        "files = [os.fstat(number) for number in range(3)]\n"
+        f"pathlib.Path({str(told)!r}).write_text(' '.join(f'{{f.st_dev}}:{{f.st_ino}}' for f in files))\n"
+        "pathlib.Path(sys.argv[3]).write_bytes(b'file')\n"
+        "print('x' * 10_000_000)\n"
+        "print('y' * 10_000_000, file=sys.stderr)\n"
+    )
+    popen = subprocess.Popen
+
+    def start(command: list[str], **options: Any) -> Any:
+        return popen([command[0], str(script), *command[3:]], **options)
+
+    monkeypatch.setattr(subprocess, "Popen", start)
+    service_settings = service.settings.model_copy(update={"sandbox": "off"})
+    export_id = client.post(address(result, "ply")).json()["id"]
+    run_export(export_id, service.database, service.storage, service_settings, "worker-1")
+    assert client.get(address(result, "ply")).json()["state"] == "succeeded"
+    own = {f"{stat.st_dev}:{stat.st_ino}" for stat in map(os.fstat, range(3))} - {_of(os.devnull)}
+    given = told.read_text().split()
+    assert given[0] == _of(os.devnull)
+    assert not own & set(given)
+
+
+def _of(path: str) -> str:
+    stat = os.stat(path)
+    return f"{stat.st_dev}:{stat.st_ino}"

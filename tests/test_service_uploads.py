@@ -9,9 +9,14 @@ import logging
 import threading
 from pathlib import Path
 
+import h5py
+import numpy as np
 import pytest
 import sqlalchemy as sa
 import structlog
+import tifffile
+from cube_files import random_values
+from scipy import io as scipy_io
 from service_scene import Running, serving
 from upload_scene import (
     SAMPLES,
@@ -253,6 +258,25 @@ def test_names_stay_out_of_paths_and_logs(
     paths = [str(p) for p in service.settings.data_dir.rglob("*")]
     assert not any("ller" in p or "etc" in p for p in paths)
     assert "ller" not in json.dumps(client.get("/v1/audit").json())
+
+
+@pytest.mark.parametrize("name", ["scan.h5", "scan.nc", "scan.npz", "scan.mat", "scan.tif"])
+def test_cubes_of_every_format_arrive(service: Running, name: str, tmp_path: Path) -> None:
+    """HDF5 asks for a lock, where the upload that is being finished has one."""
+    path, cube, nm = tmp_path / name, random_values("u2"), np.linspace(400, 1000, 11)
+    if name.endswith((".h5", ".nc")):
+        with h5py.File(path, "w") as f:
+            f["cube"], f["wavelength"] = cube, nm
+    elif name.endswith(".npz"):
+        np.savez(path, cube=cube, wavelength=nm)
+    elif name.endswith(".mat"):
+        scipy_io.savemat(path, {"cube": cube, "wavelength": nm})
+    else:
+        tifffile.imwrite(path, cube.transpose(2, 0, 1), photometric="minisblack", compression="zstd")
+    client = service.client()
+    data = path.read_bytes()
+    at = created(client, new_acquisition(client), "cube", len(data), name)
+    assert patch(client, at, data, 0).headers["Specimap-Verdict"] == "accepted", result(client, at)
 
 
 def test_second_cube_is_refused_before_and_after_it_is_sent(service: Running) -> None:

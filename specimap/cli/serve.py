@@ -33,6 +33,7 @@ def serve(*, workers: bool, say: Callable[[str], None]) -> None:
     import uvicorn
 
     from specimap.service.app import create_app
+    from specimap.service.connections import Connection
 
     settings = load_settings()
     set_up_logs(settings)
@@ -64,7 +65,7 @@ def serve(*, workers: bool, say: Callable[[str], None]) -> None:
 
     config = uvicorn.Config(
         app, log_config=None, access_log=False, ws="none", lifespan="on", proxy_headers=False, server_header=False,
-        timeout_graceful_shutdown=5, timeout_keep_alive=75,
+        timeout_graceful_shutdown=5, timeout_keep_alive=75, http=Connection,
     )  # fmt: skip
     # The server raises the signal that stopped it once more at its end: the workers still have to be ended then.
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -7,11 +7,12 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 from uuid import uuid4
 
 import sqlalchemy as sa
@@ -29,11 +30,14 @@ from specimap.infra.settings import ServiceSettings
 from specimap.infra.storage import Storage
 from specimap.workers.cells import Cell, Cells, is_plain
 from specimap.workers.export_main import REFUSED
+from specimap.workers.processes import LAST_LINES
 
 DOCUMENTS = (FileFormat.HTML, FileFormat.PDF)
 POLL_SECONDS = 0.1
 HELD_SECONDS = 2.0
 """How often a running export's row is asked whether it still is this executor's."""
+LARGEST_ANSWER = 1 << 16
+"""Bytes that are read of what the process says: it may have been taken over."""
 
 
 def run_export(
@@ -210,32 +214,53 @@ def _run_once(
         sys.executable, "-m", "specimap.workers.export_main", str(cell.given), format.value, str(target),
         str(os.getpid()), str(settings.stage_memory_bytes),
     ]  # fmt: skip
-    # A session of its own: a kill reaches whatever it starts, and the terminal's signals do not reach it.
-    process = subprocess.Popen(
-        cells.confined(command, cell, backends=False), stdout=subprocess.PIPE, text=True, start_new_session=True,
-        env=cells.environment(cell),
-    )  # fmt: skip
+    with tempfile.TemporaryFile(dir=cell.folder) as answer, tempfile.TemporaryFile(dir=cell.folder) as said:
+        # A session of its own: a kill reaches whatever it starts, and the terminal's signals do not reach it. It holds
+        # no file of the worker's: it could empty that of the log.
+        process = subprocess.Popen(
+            cells.confined(command, cell, backends=False), stdin=subprocess.DEVNULL, stdout=answer, stderr=said,
+            start_new_session=True, env=cells.environment(cell),
+        )  # fmt: skip
+        try:
+            _wait(process, settings, held, cancelled)
+        finally:
+            if process.poll() is None:
+                with suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+        if process.returncode not in (0, REFUSED):
+            for line in _last(said).splitlines()[-LAST_LINES:]:
+                logger().error("export's last lines", line=line[:500])
+        return process.returncode, _last(answer)
+
+
+def _wait(
+    process: subprocess.Popen[bytes],
+    settings: ServiceSettings,
+    held: Callable[[], bool],
+    cancelled: Callable[[], bool],
+) -> None:
     start = asked = time.monotonic()
-    try:
-        while True:
-            with suppress(subprocess.TimeoutExpired):
-                answer, _ = process.communicate(timeout=POLL_SECONDS)
-                return process.returncode, answer
-            now = time.monotonic()
-            if cancelled():
-                raise CancelledError("The export was stopped.", advice="It is made when a worker takes it up again.")
-            if now - start > settings.stage_seconds:
-                raise StageTimeoutError(
-                    f"The export took longer than {settings.stage_seconds:.0f} s.",
-                    advice="Raise SPECIMAP_STAGE_SECONDS.",
-                    stage="export",
-                )
-            if now - asked > HELD_SECONDS:
-                asked = now
-                if not held():
-                    raise _LostError
-    finally:
-        if process.poll() is None:
-            with suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-            process.communicate()
+    while True:
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(POLL_SECONDS)
+            return
+        now = time.monotonic()
+        if cancelled():
+            raise CancelledError("The export was stopped.", advice="It is made when a worker takes it up again.")
+        if now - start > settings.stage_seconds:
+            raise StageTimeoutError(
+                f"The export took longer than {settings.stage_seconds:.0f} s.",
+                advice="Raise SPECIMAP_STAGE_SECONDS.",
+                stage="export",
+            )
+        if now - asked > HELD_SECONDS:
+            asked = now
+            if not held():
+                raise _LostError
+
+
+def _last(file: IO[bytes]) -> str:
+    """The end of what a process wrote."""
+    file.seek(max(0, file.seek(0, os.SEEK_END) - LARGEST_ANSWER))
+    return file.read(LARGEST_ANSWER).decode("utf-8", "replace")

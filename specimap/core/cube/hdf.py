@@ -14,10 +14,11 @@ import numpy as np
 
 from specimap.core.cube.declared import WORDS, Declared, declared_of, is_word, plain
 from specimap.core.cube.discover import Variable, choose_cube, choose_wavelengths, cube_axes
-from specimap.core.cube.hdf_guard import guarded_dataset, open_guarded
+from specimap.core.cube.hdf_guard import as_text, guarded_dataset, open_guarded
 from specimap.core.cube.model import Cube, describe
 from specimap.core.cube.pixels import ArrayPixels, Pixels
 from specimap.core.cube.scratch import scratch_array
+from specimap.core.cube.shown import shown
 from specimap.core.cube.strided import native
 from specimap.core.errors import CubeContentError, CubeTruncatedError
 from specimap.core.geometry import Array, Floats
@@ -27,8 +28,10 @@ _LARGEST_CHUNK_ROW = 512 << 20
 _TRUNCATED = re.compile(r"truncated file: eof = (\d+).*stored_eof = (\d+)")
 _UNIT_ATTRIBUTES = ("units", "unit", "wavelength_units")
 _LONGEST_UNITS = 64
+_LARGEST_UNITS_BYTES = 1 << 16
 # The label of a dimension scale that stands for an axis without coordinates.
 _NETCDF_NO_NAME = "This is a netCDF dimension"
+_OF_AXES = ("DIMENSION_LABELS", "DIMENSION_LIST")
 
 
 class HdfFormat:
@@ -74,11 +77,11 @@ class HdfFormat:
 def _variables(file: h5py.File) -> list[Variable]:
     found: list[Variable] = []
 
-    def visit(name: str, node: object) -> None:  # visititems follows hard links alone
+    def visit(stored: str | bytes, node: object) -> None:  # visititems follows hard links alone
         if isinstance(node, h5py.Dataset) and node.shape is not None and (dtype := _dtype(node)) is not None:
-            axes = tuple(_axis_name(node, i) for i in range(len(node.shape)))
-            units = next((_text(node.attrs[key]) for key in node.attrs if key.lower() in _UNIT_ATTRIBUTES), None)
-            found.append(Variable(name, tuple(node.shape), dtype, axes, units, _content(name, node)))
+            name = as_text(stored)
+            units = next((_text(value) for key, value in _attributes(node) if key.lower() in _UNIT_ATTRIBUTES), None)
+            found.append(Variable(name, tuple(node.shape), dtype, _axis_names(node), units, _content(name, node)))
 
     file.visititems(visit)
     return found
@@ -86,7 +89,8 @@ def _variables(file: h5py.File) -> list[Variable]:
 
 def _content(name: str, node: h5py.Dataset) -> str | None:
     """The text of a small data set called units: a string, or MATLAB's character codes."""
-    if "unit" not in name.rpartition("/")[2].lower() or not 0 < node.size <= _LONGEST_UNITS:
+    small = 0 < node.size <= _LONGEST_UNITS and node.size * node.dtype.itemsize <= _LARGEST_UNITS_BYTES
+    if "unit" not in name.rpartition("/")[2].lower() or not small:
         return None
     if _text(node.attrs.get("MATLAB_class")) == "char" and node.dtype.kind == "u":
         return "".join(chr(code) for code in np.asarray(node[()]).ravel(order="F"))
@@ -122,7 +126,7 @@ def _attributes(node: h5py.Dataset | h5py.Group) -> Iterator[tuple[str, object]]
     """Names and values of the attributes, without those of a type that NumPy has nothing like."""
     for name in node.attrs:
         try:
-            yield name, node.attrs[name]
+            yield as_text(name), node.attrs[name]
         except (TypeError, OSError):
             continue
 
@@ -136,17 +140,32 @@ def _dtype(node: h5py.Dataset) -> np.dtype | None:
     return dtype
 
 
-def _axis_name(node: h5py.Dataset, axis: int) -> str:
-    """The axis' label, or the name of the dimension scale that NetCDF4 attaches to it."""
-    try:
-        if node.dims[axis].label:
-            return str(node.dims[axis].label)
-        label = str(node.dims[axis].keys()[0])
-        if not label or label.startswith(_NETCDF_NO_NAME):
-            label = str(node.dims[axis][0].name)
-        return label.rpartition("/")[2]
-    except (IndexError, RuntimeError):
+def _axis_names(node: h5py.Dataset) -> tuple[str, ...]:
+    """The axes' labels, or the names of the dimension scales that NetCDF4 attaches to them; empty where there are none.
+
+    Read as plain attributes: HDF5's own reader of them takes their type for granted, and crashes where it is another.
+    """
+    said = {name: np.asarray(value) for name, value in _attributes(node) if name in _OF_AXES}
+    labels, scales = (said.get(name, np.empty(0)) for name in _OF_AXES)
+    names = [""] * node.ndim
+    if labels.shape == (node.ndim,):
+        names = [_text(label) or "" for label in labels]
+    if scales.shape == (node.ndim,) and scales.dtype == object:
+        names = [name or _scale_name(node.file, scale) for name, scale in zip(names, scales, strict=True)]
+    return tuple(name.rpartition("/")[2] for name in names)
+
+
+def _scale_name(file: h5py.File, references: object) -> str:
+    """The name of the first data set that an axis' entry refers to."""
+    reference = next(iter(np.ravel(np.asarray(references, object))), None)
+    if not isinstance(reference, h5py.Reference) or not reference:
         return ""
+    try:
+        scale = file[reference]
+    except (ValueError, KeyError, OSError, RuntimeError):  # it refers to nothing
+        return ""
+    label = next((_text(value) for name, value in _attributes(scale) if name == "NAME"), None) or ""
+    return as_text(scale.name or "") if not label or label.startswith(_NETCDF_NO_NAME) else label
 
 
 def _text(value: object) -> str | None:
@@ -161,15 +180,15 @@ def _declared(path: Path, file: h5py.File, dataset: h5py.Dataset) -> Declared:
     """What the cube's own attributes say of its values, and small data sets beside it (MATLAB keeps them so)."""
     said: dict[str, object] = {}
     group = dataset.parent
-    for name in group:
+    for name in filter(str.isascii, map(as_text, group)):
         if plain(name) in WORDS and isinstance(group.get(name, getlink=True), h5py.HardLink):
             node = group[name]
             if isinstance(node, h5py.Dataset) and node.shape is not None and is_word(name, node.shape):
-                said[name] = guarded_dataset(path, file, node.name)[()]
+                said[name] = guarded_dataset(path, file, as_text(node.name))[()]
     said |= {name: value for name, value in _attributes(dataset) if plain(name) in (*WORDS, "unsigned")}
     named = ("long_name", "standard_name", "units", "unit")
     titles = (_text(value) for name, value in _attributes(dataset) if name.lower() in named)
-    return declared_of(path.name, said, str(dataset.name), *titles)
+    return declared_of(path.name, said, as_text(dataset.name), *titles)
 
 
 def _pixels(path: Path, dataset: h5py.Dataset, axes: tuple[int, int, int]) -> Pixels:
@@ -181,7 +200,7 @@ def _pixels(path: Path, dataset: h5py.Dataset, axes: tuple[int, int, int]) -> Pi
     rows = chunk[axes[0]]
     row_bytes = rows * dataset.shape[axes[1]] * dataset.shape[axes[2]] * dataset.dtype.itemsize
     if row_bytes <= _LARGEST_CHUNK_ROW:
-        return _ChunkedPixels(path, dataset.name, axes, rows, row_bytes)
+        return _ChunkedPixels(path, as_text(dataset.name), axes, rows, row_bytes)
     unpacked = scratch_array(dataset.shape, dataset.dtype)
     dataset.read_direct(unpacked)
     return ArrayPixels(unpacked.transpose(axes))
@@ -207,7 +226,7 @@ class _ChunkedPixels(Pixels):
             return np.asarray(self._dataset[tuple(selection)]).transpose(self._axes)
         except OSError as error:
             raise CubeContentError(
-                f"'{self._dataset.name}' does not decode: {error}.",
+                f"'{shown(as_text(self._dataset.name))}' does not decode: {error}.",
                 advice="Save the cube again, uncompressed or with gzip.",
             ) from error
 

@@ -27,10 +27,11 @@ def open_guarded(path: Path, **options: Any) -> h5py.File:
     """
     while h5py.h5pl.size():
         h5py.h5pl.remove(0)
-    file = h5py.File(path, "r", **options)
+    # Without HDF5's lock: an upload that is being finished has one of its own, and some network disks have none.
+    file = h5py.File(path, "r", locking=False, **options)
     try:
         _check_links(path, file)
-        outside = file.visititems(lambda name, node: name if _stored_outside(node) else None)
+        outside = file.visititems(lambda name, node: as_text(name) if _stored_outside(node) else None)
         if outside is not None:
             raise _leads_out(path, outside)
     except BaseException:
@@ -41,7 +42,8 @@ def open_guarded(path: Path, **options: Any) -> h5py.File:
 
 def guarded_dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
     """The data set ``name``, whose values may be read. Raises CubeFormatError where they must not be."""
-    node = file[name]
+    # Half characters stand for the bytes of a name that is not UTF-8.
+    node = file[name.encode("utf-8", "surrogateescape")]
     if not isinstance(node, h5py.Dataset) or node.file != file or _stored_outside(node):
         raise _leads_out(path, name)
     creation = node.id.get_create_plist()
@@ -58,20 +60,23 @@ def guarded_dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
     return node
 
 
+def as_text(name: str | bytes) -> str:
+    """A name as text. h5py gives one that is not UTF-8, as some instruments write them, as its bytes."""
+    return name.decode("utf-8", "surrogateescape") if isinstance(name, bytes) else name
+
+
 def _check_links(path: Path, file: h5py.File) -> None:
     count = 0
 
     # It stops at the first name that is returned; an error raised in it would not come through h5py whole.
-    def suspicious(name: str, link: object) -> str | None:
+    def suspicious(name: bytes) -> str | None:
         nonlocal count
         count += 1
-        inside = isinstance(link, h5py.HardLink | h5py.SoftLink)
-        return None if inside and count <= _MOST_LINKS else name
+        inside = file.id.links.get_info(name).type in (h5py.h5l.TYPE_HARD, h5py.h5l.TYPE_SOFT)
+        return None if inside and count <= _MOST_LINKS else as_text(name)
 
-    try:
-        found = file.visititems_links(suspicious)  # follows neither soft nor external links
-    except TypeError as error:  # h5py's word for a link of a user-defined class
-        raise _leads_out(path, "?") from error
+    # It follows neither soft nor external links. h5py's own way to it stumbles over names that are not UTF-8.
+    found = file.id.links.visit(suspicious)
     if count > _MOST_LINKS:
         raise CubeFormatError(
             f"{path.name} holds more than {_MOST_LINKS} objects.", advice="Save the cube in a file of its own."

@@ -125,8 +125,9 @@ def _gpu_devices() -> Iterator[Path]:
 
 
 def interpreter_places(python: str) -> Iterable[Path]:
-    """What another interpreter is made of: its own environment and the one that this was made from."""
-    for path in (os.path.abspath(python), os.path.realpath(python)):
-        # One of the system's own lies among much else.
-        if str(place := Path(path).parent.parent) not in (*_SHARED, "/"):
-            yield place
+    """What another interpreter is made of: its own environment and the one that this was made from. Of one that stands
+    elsewhere, as a link in a home folder may, the program alone."""
+    for path in map(Path, (os.path.abspath(python), os.path.realpath(python))):
+        prefix = path.parent.parent
+        whole = (prefix / "pyvenv.cfg").is_file() or any(prefix.glob("lib*/python3*/os.py"))
+        yield prefix if whole else path

@@ -1,7 +1,8 @@
 """A seccomp filter: system calls that a process which reads files from outside has no use for fail from now on.
 
 Landlock guards paths; this guards what has none: sockets of every kind, signals, other processes' memory, System V
-memory, io_uring (which would go around both), and changes to the rights and times of files elsewhere.
+memory and queues, io_uring (which would go around both), and changes to the rights, owner, attributes and times of
+files, which a descriptor opened for reading is enough for.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ _ALWAYS: dict[str, tuple[int | None, int | None]] = {
     "inotify_add_watch": (254, 27), "keyctl": (250, 219), "add_key": (248, 217), "request_key": (249, 218),
     "mount": (165, 40), "umount2": (166, 39), "pivot_root": (155, 41), "chroot": (161, 51), "setns": (308, 268),
     "unshare": (272, 97), "mount_setattr": (442, 442), "move_mount": (429, 429), "open_tree": (428, 428),
+    "open_tree_attr": (467, 467),
     "fsopen": (430, 430), "fsconfig": (431, 431), "fsmount": (432, 432), "fspick": (433, 433),
     "open_by_handle_at": (304, 265), "name_to_handle_at": (303, 264),
     "init_module": (175, 105), "finit_module": (313, 273), "delete_module": (176, 106), "kexec_load": (246, 104),
@@ -38,20 +40,23 @@ _ALWAYS: dict[str, tuple[int | None, int | None]] = {
     "iopl": (172, None), "ioperm": (173, None), "syslog": (103, 116), "vhangup": (153, 58),
     "setpriority": (141, 140), "ioprio_set": (251, 30), "sched_setscheduler": (144, 119), "sched_setparam": (142, 118),
     "sched_setattr": (314, 274), "quotactl_fd": (443, 443), "process_mrelease": (448, 448),
-    "shmget": (29, 194), "shmat": (30, 196), "shmctl": (31, 195), "semget": (64, 190), "msgget": (68, 186),
+    "shmget": (29, 194), "shmat": (30, 196), "shmctl": (31, 195), "semget": (64, 190), "semctl": (66, 191),
+    "semop": (65, 193), "semtimedop": (220, 192), "msgget": (68, 186), "msgsnd": (69, 189), "msgrcv": (70, 188),
+    "msgctl": (71, 187),
     "mq_open": (240, 180), "mq_unlink": (241, 181),
-    "chmod": (90, None), "fchmodat": (268, 53), "fchmodat2": (452, 452), "chown": (92, None), "lchown": (94, None),
-    "fchownat": (260, 54), "setxattr": (188, 5), "lsetxattr": (189, 6), "setxattrat": (463, 463),
-    "removexattr": (197, 14), "lremovexattr": (198, 15), "removexattrat": (466, 466), "utime": (132, None),
-    "utimes": (235, None), "futimesat": (261, None),
+    "chmod": (90, None), "fchmod": (91, 52), "fchmodat": (268, 53), "fchmodat2": (452, 452), "chown": (92, None),
+    "fchown": (93, 55), "lchown": (94, None), "fchownat": (260, 54), "setxattr": (188, 5), "lsetxattr": (189, 6),
+    "fsetxattr": (190, 7), "setxattrat": (463, 463), "removexattr": (197, 14), "lremovexattr": (198, 15),
+    "fremovexattr": (199, 16), "removexattrat": (466, 466), "file_setattr": (469, 469), "utime": (132, None),
+    "utimes": (235, None), "futimesat": (261, None), "utimensat": (280, 88),
 }  # fmt: skip
 _ALONE: dict[str, tuple[int | None, int | None]] = {
     "execve": (59, 221), "execveat": (322, 281), "fork": (57, None), "vfork": (58, None), "kill": (62, 129),
     "tkill": (200, 130), "setpgid": (109, 154), "setsid": (112, 157), "setrlimit": (160, 164),
-    "socketpair": (53, 199), "sched_setaffinity": (203, 122),
+    "socketpair": (53, 199),
 }  # fmt: skip
-_KILL, _TGKILL, _SENDTO, _SOCKETPAIR, _PRLIMIT, _CLONE, _CLONE3, _UTIMENSAT = (
-    (62, 129), (234, 131), (44, 206), (53, 199), (302, 261), (56, 220), (435, 435), (280, 88),
+_KILL, _TGKILL, _SENDTO, _SOCKETPAIR, _PRLIMIT, _CLONE, _CLONE3, _AFFINITY = (
+    (62, 129), (234, 131), (44, 206), (53, 199), (302, 261), (56, 220), (435, 435), (203, 122),
 )  # fmt: skip
 _MACHINES = {"x86_64": (0, 0xC000003E), "aarch64": (1, 0xC00000B7)}
 """Column of the tables, and the kernel's name for the architecture."""
@@ -61,7 +66,7 @@ _LOAD, _EQUAL, _AT_LEAST, _AND, _ANY_BIT, _RETURN = 0x20, 0x15, 0x35, 0x54, 0x45
 _ALLOW, _ERROR, _END = 0x7FFF0000, 0x00050000, 0x80000000
 _NUMBER, _ARCHITECTURE = 0, 4
 _CLONE_THREAD, _CLONE_NAMESPACES = 0x10000, 0x7E020000
-_DATAGRAM = 2
+_UNIX, _STREAM = 1, 1
 _SET_FILTER, _ALL_THREADS = 1, 1
 _SECCOMP = {"x86_64": 317, "aarch64": 277}
 
@@ -121,11 +126,11 @@ def _program(alone: bool) -> list[Instruction]:
     # An address of a datagram: none is given by send(2).
     for half in (_low(4), _low(4) + 4):
         when(_SENDTO[column], ((_LOAD, 0, 0, half), (_EQUAL, 1, 0, 0)))
-    # The file by its path, not by an open descriptor.
-    for half in (_low(1), _low(1) + 4):
-        when(_UTIMENSAT[column], ((_LOAD, 0, 0, half), (_EQUAL, 1, 0, 0)))
-    # A pair of streams leads nowhere else; one of datagrams can be connected anew.
-    when(_SOCKETPAIR[column], ((_LOAD, 0, 0, _low(1)), (_AND, 0, 0, 0xF), (_EQUAL, 0, 1, _DATAGRAM)))
+    # A pair of streams leads nowhere else; one of datagrams, which a raw one is too, sends to any address.
+    when(_SOCKETPAIR[column], ((_LOAD, 0, 0, _low(0)), (_EQUAL, 1, 0, _UNIX)))
+    when(_SOCKETPAIR[column], ((_LOAD, 0, 0, _low(1)), (_AND, 0, 0, 0xF), (_EQUAL, 1, 0, _STREAM)))
+    # The processors of another process; its own threads it may bind by the number that means the caller.
+    when(_AFFINITY[column], () if alone else ((_LOAD, 0, 0, _low(0)), (_EQUAL, 1, 0, 0)))
     if alone:
         when(_TGKILL[column], ((_LOAD, 0, 0, _low(0)), (_EQUAL, 1, 0, os.getpid())))
         when(_CLONE[column], ((_LOAD, 0, 0, _low(0)), (_ANY_BIT, 1, 0, _CLONE_THREAD)))

@@ -1,0 +1,92 @@
+"""Connections as uvicorn keeps them, with bounds on what comes before anything is asked for a key: the head of a
+request, and what may follow its body."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+
+LARGEST_HEAD = 64 * 1024
+"""Bytes of a request's line and headers, to within one reading of the socket."""
+HEAD_SECONDS = 30.0
+"""How long they may take to come."""
+
+
+class Connection(HttpToolsProtocol):
+    """One connection. uvicorn's own gathers a head without end, and copies it anew with each piece that comes."""
+
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        self._in_head = True
+        self._bytes = 0
+        self._moved = False
+        self._deadline: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Wait for the first request."""
+        super().connection_made(transport)
+        self._wait_for_head()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Wait no more."""
+        self._stop_waiting()
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Parse a piece, and close the connection where pieces bring neither a whole head nor a body."""
+        if self._in_head and self._deadline is None:
+            self._wait_for_head()
+        self._moved = False
+        super().data_received(data)
+        if self._moved or self.transport.is_closing():
+            return
+        self._bytes += len(data)
+        if self._bytes > LARGEST_HEAD:
+            self._stop_waiting()
+            self.send_400_response("The request's headers are too large.")
+
+    def on_header(self, name: bytes, value: bytes) -> None:
+        """Keep a header; one after the body has no meaning here."""
+        if self._in_head:
+            super().on_header(name, value)
+
+    def on_message_begin(self) -> None:
+        """Begin a request."""
+        self._progress(in_head=True)
+        super().on_message_begin()
+
+    def on_headers_complete(self) -> None:
+        """Hand the request over."""
+        self._progress(in_head=False)
+        self._stop_waiting()
+        super().on_headers_complete()
+
+    def on_body(self, body: bytes) -> None:
+        """Hand a piece of the body over."""
+        self._progress(in_head=False)
+        super().on_body(body)
+
+    def on_message_complete(self) -> None:
+        """Be ready for the next request."""
+        self._progress(in_head=True)
+        super().on_message_complete()
+
+    def _progress(self, *, in_head: bool) -> None:
+        self._in_head, self._bytes, self._moved = in_head, 0, True
+
+    def _wait_for_head(self) -> None:
+        self._deadline = self.loop.call_later(HEAD_SECONDS, self._late)
+
+    def _late(self) -> None:
+        if self.cycle is not None and not self.cycle.response_complete:
+            # An answer is under way: the next request may wait for it.
+            self._wait_for_head()
+        else:
+            self.timeout_keep_alive_handler()
+
+    def _stop_waiting(self) -> None:
+        if self._deadline is not None:
+            self._deadline.cancel()
+            self._deadline = None
