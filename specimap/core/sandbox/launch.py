@@ -62,7 +62,7 @@ def confined(command: Sequence[str], reach: Reach, mode: Mode) -> list[str]:
     """
     if mode == "off":
         return list(command)
-    plan = json.dumps({"mode": mode, "rules": program_rules(reach)})
+    plan = json.dumps({"mode": mode, "rules": program_rules(reach)}, allow_nan=False)
     package = str(Path(__file__).resolve().parents[2])
     return [sys.executable, "-I", "-S", "-B", "-c", _LAUNCHER, package, plan, *command]
 
