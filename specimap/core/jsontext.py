@@ -12,10 +12,10 @@ import numpy as np
 
 def json_ready(value: object) -> Any:
     """``value`` with numpy's numbers and arrays, tuples, sets and paths as JSON's; what is not finite as null, what
-    JSON does not know as text, and half characters as question marks."""
+    JSON does not know as text, and half characters by their codes."""
     if isinstance(value, str):
         # Half characters stand for bytes of a path that are no UTF-8; JSON has none.
-        return value if value.isascii() else value.encode("utf-8", "replace").decode()
+        return value if value.isascii() else value.encode("utf-8", "backslashreplace").decode()
     if value is None or isinstance(value, bool | int):
         return value
     if isinstance(value, float):

@@ -106,7 +106,7 @@ class CubeCameraFigures(Section):
     markers_found_in: str
     model: Literal["frame", "scan_rows", "scan_columns"] = "frame"
     """A frame camera, or a push-broom that recorded the cube row by row or column by column."""
-    pixel_aspect: float = 1.0
+    pixel_aspect: Figure = 1.0
     """Height of a pixel over its width."""
 
 
