@@ -54,6 +54,11 @@ def test_output_folders_that_cannot_be_used(small: OnDisk, tmp_path: Path) -> No
     assert run_refused(small.photos, small.header, foreign)["code"] == "output_exists"
     assert (foreign / "thesis.txt").read_text() == "mine"
     assert len(list(foreign.iterdir())) == 1
+    latin = tmp_path / os.fsdecode(b"m\xfcller") / "out"
+    refusal = run_refused(small.photos, small.header, latin)
+    assert refusal["code"] == "output_not_writable"
+    assert "m\ufffdller" in str(refusal["message"])
+    assert not latin.parent.exists()
     assert run_refused(small.photos, small.header, Path("/proc/specimap"))["code"] in (
         "output_not_writable", "not_found",
     )  # fmt: skip

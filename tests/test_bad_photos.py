@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,7 +17,10 @@ from scenes import SMALL, OnDisk, phantom_on_disk, read_corners, run_refused, sp
 from test_acquisition import bomb
 
 from specimap.core.accuracy import compare_with_truth
+from specimap.core.acquisition import AcquisitionSettings, read_photos
 from specimap.core.cloud import Cloud
+from specimap.core.jsontext import json_text
+from specimap.core.photofolder import photo_folder, photo_paths
 from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline
 from specimap.core.report import Report
 
@@ -42,6 +46,22 @@ def test_photos_that_are_all_bad(small: OnDisk, tmp_path: Path) -> None:
     refusal = run_refused(photos, small.header, tmp_path / "out")
     assert refusal["code"] == "photo_unreadable"
     assert "0.jpg" in str(refusal["message"])
+
+
+def test_names_that_are_no_utf8_are_shown_as_far_as_they_are(small: OnDisk, tmp_path: Path) -> None:
+    """As unpacked from an archive of another system."""
+    photos = copied(small.photos, tmp_path / "photos")
+    first = min(photos.iterdir())
+    first.rename(photos / os.fsdecode(b"sch\xf6n.jpg"))
+    (photos / os.fsdecode(b"n\xe4chste.jpg")).write_text("a letter")
+    (photos / os.fsdecode(b"\xff.txt")).write_text("")
+    (photos / os.fsdecode(b"\xfe")).mkdir()
+    read, refused = read_photos(photo_paths(photos), AcquisitionSettings())
+    assert "sch\ufffdn.jpg" in {p.name for p in read}
+    assert len(read) == len(list(small.photos.iterdir()))
+    assert [(r.name, r.code) for r in refused] == [("n\ufffdchste.jpg", "photo_unreadable")]
+    said = json_text([*photo_folder(photos).remarks(), refused[0].reason], ensure_ascii=False)
+    assert said.encode("utf-8").decode().count("\ufffd") == 3
 
 
 @pytest.fixture(scope="module")
@@ -203,6 +223,16 @@ def test_no_marker_anywhere(small: OnDisk, tmp_path: Path) -> None:
     for path in photos.iterdir():
         without_markers(path, small)
     assert run_refused(photos, small.header, tmp_path / "out")["code"] == "no_markers_found"
+
+
+def test_mirrored_photos_are_said_to_be_mirrored(small: OnDisk, tmp_path: Path) -> None:
+    """As a phone's front camera stores them."""
+    photos = copied(small.photos, tmp_path / "photos")
+    for path in photos.iterdir():
+        cv2.imwrite(str(path), image_of(path)[:, ::-1])
+    refusal = run_refused(photos, small.header, tmp_path / "out")
+    assert refusal["code"] == "no_markers_found"
+    assert "mirrored" in str(refusal["message"])
 
 
 @pytest.mark.parametrize("given", ["DICT_5X5_50", "DICT_6X6_1000", "DICT_APRILTAG_16h5", "DICT_7X7_1000"])

@@ -98,6 +98,7 @@ def test_numbers_of_numpy_paths_and_sets() -> None:
         "f4": 0.5, "nan": None, "i": 3, "b": True, "7": "/a/b", "array": [[1.0, None], [None, -2.0]], "set": [1],
         "double": None,
     }  # fmt: skip
+    assert strictly(json_text({"a\udcff": Path("b\udcff"), "c": "\udcff"})) == {r"a\udcff": r"b\udcff", "c": r"\udcff"}
     assert json_ready(Spread(mean=1, std=2, n=3)).startswith("mean=1")
     assert strictly(json_log_line({"a": float("nan")}, default=str, sort_keys=True)) == {"a": None}
 

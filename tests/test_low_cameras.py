@@ -11,9 +11,11 @@ from true_depth import true_depth
 from specimap.core.errors import DepthNotFoundError
 from specimap.core.geometry import Floats, Intrinsics, Pose, View, look_at
 from specimap.core.phantom import Phantom, PhantomSettings
+from specimap.core.reconstruct import dense
 from specimap.core.reconstruct.dense import dense_depth
-from specimap.core.reconstruct.depth import Bytes, DepthSettings, choose_pairs
+from specimap.core.reconstruct.depth import Bytes, DepthSettings, choose_pairs, sight_angles
 from specimap.core.reconstruct.volume import Volume, lattice_over, volume_over
+from specimap.core.surface import SurfaceSettings
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -112,6 +114,24 @@ def test_photos_from_opposite_sides_are_said_to_be_too_far_apart() -> None:
     poses = tuple(poses_of(phantom)[k] for k in (0, 8, 16))
     said = refusal(bare, phantom.views[0].intrinsics, poses, phantom.truth.marker_corners)
     assert "No two of the 3 photos" in said.message
+
+
+def test_few_photos_all_around_are_said_to_lie_too_far_apart() -> None:
+    """Seven photos round the specimen show the same, but look at it from 36 degrees apart."""
+    lens = Intrinsics.centred(448, 448, 380.0)
+    angles = np.linspace(0, 2 * np.pi, 7, endpoint=False)
+    poses = tuple(look_at(np.array([130 * np.cos(a), 130 * np.sin(a), 150.0]), np.zeros(3), UP) for a in angles)
+    corners = low().truth.marker_corners
+    neighbours = np.sort(sight_angles(poses, volume_over(corners, poses).centre), axis=1)[:, 1]
+    assert 33 < neighbours.min() < neighbours.max() < 42
+    said = refusal([np.zeros((448, 448, 3), np.uint8)] * 7, lens, poses, corners)
+    assert f"{np.median(neighbours):.0f} degrees apart: too far" in said.message
+    assert "10 to 20 degrees" in said.advice
+
+
+def test_two_maps_alone_are_no_surface() -> None:
+    """Fusion wants three; what two show is refused where the reason is known."""
+    assert SurfaceSettings().least_weight <= dense.LEAST_MAPS
 
 
 def test_photos_of_single_markers_are_said_to_show_nothing_in_common() -> None:

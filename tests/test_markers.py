@@ -10,7 +10,9 @@ from scenes import EDGE_MM, marker_scene, rotation_deg
 
 from specimap.core.errors import MarkerGeometryError
 from specimap.core.geometry import Floats, Intrinsics, Pose, fit_similarity
+from specimap.core.reconstruct.backend import CornersInPhotos
 from specimap.core.reconstruct.markers import MarkerSolution, solve_from_markers
+from specimap.core.reconstruct.misread import misread, start_without, without
 from specimap.core.reconstruct.squares import two_poses
 from specimap.core.solver import MarkerScene, Observations, corners_of, rms_px, solve, square_corners
 
@@ -140,6 +142,46 @@ def test_one_wrong_marker_reading_is_left_out() -> None:
     solution = solved(replace(seen, corners_px=corners), (0, 1, 2, 3))
     assert len(solution.seen.photo) == len(seen.photo) - 1
     assert corner_errors(solution.scene, truth.corners).max() < 0.1
+
+
+def with_readings(seen: Observations, false: list[tuple[int, int, tuple[float, float]]]) -> Observations:
+    """Squares of 20 px besides, (photo, marker, place)."""
+    square = np.array([[0.0, 0], [20, 0], [20, 20], [0, 20]])
+    return Observations(
+        np.append(seen.photo, [p for p, _, _ in false]),
+        np.append(seen.marker, [m for _, m, _ in false]),
+        np.concatenate([seen.corners_px, *(square[None] + at for _, _, at in false)]),
+        np.append(seen.sigma_px, [0.1] * len(false)),
+    )
+
+
+def test_ids_that_no_two_photos_show_at_one_place_are_false_readings() -> None:
+    """Each shows in two photos or three, as ids of texture do in dictionaries of few bits; the rest stays as it was."""
+    truth, seen = marker_scene(photos=10, markers=6, noise_px=0.1)
+    places = [(40.0, 30.0), (560.0, 60.0), (330.0, 420.0)]
+    false = [(3 * k % 10, 6, places[k]) for k in range(3)] + [(1, 7, places[1]), (6, 7, places[0])]
+    ids = (0, 1, 2, 3, 4, 5, 104, 590)
+    corners = CornersInPhotos(with_readings(seen, false), ids)
+    solution = solved(corners.seen, ids)
+    assert misread(corners, solution) == {104, 590}
+    left = without(corners, {104, 590})
+    assert left.marker_ids == ids[:6]
+    assert np.array_equal(left.seen.corners_px, seen.corners_px)
+    assert np.array_equal(left.seen.marker, seen.marker)
+    again = solve_from_markers(
+        left.seen, left.marker_ids, SIZE, edge_mm=EDGE_MM, start=start_without(solution, {104, 590})
+    )
+    assert again.markers == ids[:6]
+    assert 0 < corner_errors(again.scene, truth.corners).max() < 0.05
+
+
+def test_a_marker_that_was_moved_is_no_false_reading() -> None:
+    """It shows at one place in five photos, at another in five: that contradiction is for the gates to tell."""
+    _, seen = marker_scene(photos=10, markers=6, noise_px=0.1)
+    moved = seen.corners_px.copy()
+    moved[(seen.marker == 2) & (seen.photo >= 5)] += 40.0
+    corners = CornersInPhotos(replace(seen, corners_px=moved), tuple(range(6)))
+    assert not misread(corners, solved(corners.seen, corners.marker_ids))
 
 
 def test_an_earlier_solution_leads_to_the_same_answer() -> None:

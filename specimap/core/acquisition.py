@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specimap.core.errors import PhotoRawError, PhotoUnreadableError, TooFewPhotosError
+from specimap.core.files import name_as_text
 from specimap.core.photofile import CameraStated, decode_photo
 from specimap.core.photofolder import photo_folder
 
@@ -115,15 +116,16 @@ def read_photo(path: Path, settings: AcquisitionSettings) -> Photo:
     size = round(width * factor), round(height * factor)
     if min(size) < LEAST_SIDE_PX:
         raise PhotoUnreadableError(
-            f"{path.name} has {decoded.full_size[0]} x {decoded.full_size[1]} pixels: too few to show anything.",
+            f"{name_as_text(path)} has {decoded.full_size[0]} x {decoded.full_size[1]} pixels: too few to show "
+            "anything.",
             advice="Give the photo as the phone made it.",
-            photo=path.name,
+            photo=name_as_text(path),
         )
     if factor < 1:
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
     equivalent = decoded.stated.focal_35mm
     return Photo(
-        path.name, np.ascontiguousarray(image), decoded.full_size,
+        name_as_text(path), np.ascontiguousarray(image), decoded.full_size,
         equivalent / FULL_FRAME_DIAGONAL_MM * math.hypot(*size) if equivalent else None,
         decoded.stated.subject_mm, sharpness_of(image), decoded.digest, decoded.quarter_turns, decoded.stated,
     )  # fmt: skip
@@ -160,7 +162,7 @@ def read_photos(
         try:
             return read_photo(path, settings)
         except PhotoUnreadableError as error:
-            return Refusal(path.name, error.code, error.message)
+            return Refusal(name_as_text(path), error.code, error.message)
 
     seen: dict[str, str] = {}
     with ThreadPoolExecutor(workers) as pool:

@@ -182,7 +182,13 @@ def fitting_dictionaries(images: list[Bytes]) -> dict[str, int]:
     """
     votes: dict[str, int] = {}
     for name in DICTIONARY_TRIALS:
-        shown = Counter(i for image in images for i in {d.marker_id for d in detect_markers(image, name, expected=0)})
-        # Texture decodes as a marker now and then, but not twice as the same one.
-        votes[name] = sum(n for n in shown.values() if n >= 2)
+        votes[name] = shared_sightings(images, name)
     return dict(sorted(((n, v) for n, v in votes.items() if v), key=lambda pair: -pair[1]))
+
+
+def shared_sightings(images: list[Bytes], dictionary: str) -> int:
+    """Sightings of a dictionary's markers in ``images`` (each (H, W) uint8), of ids that two images share."""
+    found = ({d.marker_id for d in detect_markers(image, dictionary, expected=0)} for image in images)
+    shown = Counter(i for ids in found for i in ids)
+    # Texture decodes as a marker now and then, but not twice as the same one.
+    return sum(n for n in shown.values() if n >= 2)

@@ -15,6 +15,11 @@ from specimap.core.errors import OutputNotWritableError, StorageFullError
 UNWRITABLE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.ENOENT, errno.ENAMETOOLONG, errno.ELOOP)
 
 
+def name_as_text(path: Path) -> str:
+    """A file's name for messages and reports: bytes that are no UTF-8, as on disks of other systems, become U+FFFD."""
+    return os.fsencode(path.name).decode("utf-8", "replace")
+
+
 @contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
     """Turn the operating system's refusals while writing ``path`` into typed errors."""

@@ -11,20 +11,23 @@ import numpy as np
 
 
 def json_ready(value: object) -> Any:
-    """``value`` with numpy's numbers and arrays, tuples, sets and paths as JSON's; what is not finite as null, and what
-    JSON does not know as text."""
-    if value is None or isinstance(value, str | bool | int):
+    """``value`` with numpy's numbers and arrays, tuples, sets and paths as JSON's; what is not finite as null, what
+    JSON does not know as text, and half characters by their codes."""
+    if isinstance(value, str):
+        # Half characters stand for bytes of a path that are no UTF-8; JSON has none.
+        return value if value.isascii() else value.encode("utf-8", "backslashreplace").decode()
+    if value is None or isinstance(value, bool | int):
         return value
     if isinstance(value, float):
         # float: numpy's double is one by class, but not for every encoder.
         return float(value) if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {str(key): json_ready(item) for key, item in value.items()}
+        return {json_ready(str(key)): json_ready(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
         return json_ready(value.tolist())
     if isinstance(value, list | tuple | set | frozenset):
         return [json_ready(item) for item in value]
-    return str(value)
+    return json_ready(str(value))
 
 
 def json_text(

@@ -14,6 +14,7 @@ from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 from pillow_heif import register_heif_opener
 
 from specimap.core.errors import PhotoRawError, PhotoUnreadableError
+from specimap.core.files import name_as_text
 from specimap.core.photoformats import FORMATS, NAMES, RAW_SUFFIXES, suffix_of
 
 register_heif_opener()
@@ -120,9 +121,9 @@ def decode_photo(path: Path, least_px: int) -> Decoded:
     except Exception as error:
         # Not a list of types: on damaged files the decoders raise anything, ZeroDivisionError included.
         raise PhotoUnreadableError(
-            f"{path.name} does not decode as an image ({_reason(error)}).",
+            f"{name_as_text(path)} does not decode as an image ({_reason(error)}).",
             advice="Copy the photo from the phone again, or take it again.",
-            photo=path.name,
+            photo=name_as_text(path),
         ) from error
 
 
@@ -182,28 +183,30 @@ def _bytes_of(path: Path) -> bytes:
         data = path.read_bytes()
     except OSError as error:
         raise PhotoUnreadableError(
-            f"{path.name} cannot be read ({error.strerror or error}).",
+            f"{name_as_text(path)} cannot be read ({error.strerror or error}).",
             advice="Let the account that runs Specimap read the photo.",
-            photo=path.name,
+            photo=name_as_text(path),
         ) from error
     if not data:
         raise PhotoUnreadableError(
-            f"{path.name} is empty.", advice="Copy the photo from the phone again, or take it again.", photo=path.name
+            f"{name_as_text(path)} is empty.",
+            advice="Copy the photo from the phone again, or take it again.",
+            photo=name_as_text(path),
         )
     return data
 
 
 def _unusable(path: Path, why: str) -> PhotoUnreadableError:
     return PhotoUnreadableError(
-        f"{path.name} {why}.", advice="Give the photo as the phone made it.", photo=path.name
+        f"{name_as_text(path)} {why}.", advice="Give the photo as the phone made it.", photo=name_as_text(path)
     )
 
 
 def _raw(path: Path) -> PhotoRawError:
     return PhotoRawError(
-        f"{path.name} is a raw file, the readings of a sensor: export it as JPEG.",
+        f"{name_as_text(path)} is a raw file, the readings of a sensor: export it as JPEG.",
         advice="Export the raw files as JPEG, all with the same settings, not cropped.",
-        photo=path.name,
+        photo=name_as_text(path),
     )
 
 

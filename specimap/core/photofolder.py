@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from specimap.core.errors import NotFoundError, TooFewPhotosError
+from specimap.core.files import name_as_text
 from specimap.core.photoformats import NAMES, PHOTO_SUFFIXES, RAW_SUFFIXES
 
 MOST_NAMED = 20
@@ -43,13 +44,13 @@ def photo_folder(folder: Path) -> PhotoFolder:
     try:
         for path in sorted(p for p in folder.iterdir() if not p.name.startswith(".")):
             if path.is_dir():
-                passed_over.append((path.name, _what_holds(path)))
+                passed_over.append((name_as_text(path), _what_holds(path)))
             elif not path.is_file():
-                passed_over.append((path.name, "no regular file"))
+                passed_over.append((name_as_text(path), "no regular file"))
             elif _is_photo(path):
                 photos.append(path)
             else:
-                passed_over.append((path.name, "its name does not end as a photo's"))
+                passed_over.append((name_as_text(path), "its name does not end as a photo's"))
     except PermissionError as error:
         raise NotFoundError(
             f"{folder} may not be read.", advice="Let the account that runs Specimap read the folder."

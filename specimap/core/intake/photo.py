@@ -123,6 +123,10 @@ def _markers(ids: list[int], grey: NDArray[np.uint8], dictionary: str) -> Verdic
         return Verdict(
             "doubtful", "few_markers", reason, "Take it again with two or more markers whole in the picture."
         )
+    if len(detect_markers(np.ascontiguousarray(grey[:, ::-1]), dictionary, expected=0)) >= LEAST_MARKERS:
+        reason = f"It is mirrored: markers of {dictionary} read in its mirror image only."
+        advice = "Take it again with the phone's rear camera, and do not flip it."
+        return Verdict("doubtful", NoMarkersFoundError.code, reason, advice)
     # Twice at different sizes: texture that reads as a marker by chance does not do so again.
     fitting = fitting_dictionaries([grey, np.asarray(cv2.resize(grey, None, fx=0.75, fy=0.75), np.uint8)])
     if fitting:

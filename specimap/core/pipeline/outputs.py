@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from specimap.core.errors import OutputExistsError
+from specimap.core.errors import OutputExistsError, OutputNotWritableError
 from specimap.core.files import disk_errors, remove, remove_leftovers, replace
 from specimap.core.pipeline.artefacts import Store
 
@@ -75,6 +76,12 @@ def prepare_folder(folder: Path) -> None:
         OutputExistsError: it holds files that Specimap did not write.
         OutputNotWritableError: it cannot be made or written.
     """
+    if not _is_utf8(folder):
+        raise OutputNotWritableError(
+            f"The path {os.fsencode(folder.absolute()).decode('utf-8', 'replace')} is not UTF-8, in which the results "
+            "cannot be written.",
+            advice="Choose a folder whose whole path is UTF-8.",
+        )
     with disk_errors(folder):
         if folder.exists() and not folder.is_dir():
             raise OutputExistsError(f"{folder} is a file.", advice="Name a folder for the results.")
@@ -88,6 +95,14 @@ def prepare_folder(folder: Path) -> None:
         mark.write_text("An output folder of Specimap.\n", encoding="utf-8")
         for place in (folder, folder / "stages"):
             remove_leftovers(place)
+
+
+def _is_utf8(folder: Path) -> bool:
+    try:
+        os.fsencode(folder.absolute()).decode("utf-8")
+    except UnicodeDecodeError:
+        return False
+    return True
 
 
 @contextmanager

@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from specimap.core.acquisition import Photo, Refusal
 from specimap.core.errors import DuplicateMarkersError, NoMarkersFoundError, WrongDictionaryError
-from specimap.core.fiducials import Detection, find_markers, fitting_dictionaries, measured_at, tone_of
+from specimap.core.fiducials import (
+    Detection,
+    find_markers,
+    fitting_dictionaries,
+    measured_at,
+    shared_sightings,
+    tone_of,
+)
 from specimap.core.geometry import Intrinsics, Pose
 from specimap.core.reconstruct.depth import DepthMap, DepthSettings
 from specimap.core.solver import Observations
@@ -127,7 +134,7 @@ def corners_in_photos(
     shared = {i for i, n in shown.items() if n - twice[i] >= 2}
     rows = [(photo, d) for photo, d in rows if d.marker_id in shared]
     if len(rows) < len(photos):
-        _refuse_other_dictionary(photos, rows, dictionary)
+        _refuse_unreadable(photos, rows, dictionary)
     if not rows:
         raise NoMarkersFoundError(
             f"No marker of {dictionary} shows in two of the photos.",
@@ -145,12 +152,23 @@ def corners_in_photos(
     return CornersInPhotos(seen, ids_used)
 
 
-def _refuse_other_dictionary(photos: list[Photo], rows: list[tuple[int, Detection]], dictionary: str) -> None:
-    """Where few markers show: does another dictionary read far more? A wrong one reads a false marker now and then."""
+def _refuse_unreadable(photos: list[Photo], rows: list[tuple[int, Detection]], dictionary: str) -> None:
+    """Where few markers show: do far more read in the photos' mirror images, or in another dictionary?
+
+    A wrong one reads a false marker now and then.
+    """
     few = range(0, len(photos), max(1, len(photos) // DICTIONARY_SAMPLE))
-    fitting = fitting_dictionaries([photos[p].grey for p in few])
-    own = sum(photo in few for photo, _ in rows)
-    fitting = {name: seen for name, seen in fitting.items() if seen > DICTIONARY_FACTOR * own}
+    images = [photos[p].grey for p in few]
+    many = DICTIONARY_FACTOR * max(sum(photo in few for photo, _ in rows), 1)
+    mirrored = shared_sightings([np.ascontiguousarray(image[:, ::-1]) for image in images], dictionary)
+    if mirrored > many:
+        raise NoMarkersFoundError(
+            f"The photos are mirrored: markers of {dictionary} read in their mirror images only.",
+            advice="Take the photos with the phone's rear camera, and do not flip them.",
+            dictionary=dictionary,
+        )
+    fitting = fitting_dictionaries(images)
+    fitting = {name: seen for name, seen in fitting.items() if seen > many}
     if not fitting:
         return
     best = next(iter(fitting))

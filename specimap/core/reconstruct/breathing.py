@@ -21,6 +21,7 @@ from specimap.core.errors import SpecimapError
 from specimap.core.geometry import Floats, Intrinsics, Pose, rotation_from_vector, skew
 from specimap.core.reconstruct.backend import CornersInPhotos
 from specimap.core.reconstruct.markers import MarkerSolution, solve_from_markers
+from specimap.core.reconstruct.misread import misread, start_without, without
 from specimap.core.robust import MEDIAN_OF_RAYLEIGH
 from specimap.core.solver import HUBER, MarkerScene, Observations
 
@@ -58,7 +59,7 @@ def settle_breathing(
     """Photos and corners as one shared lens would have seen them, with the zooms (P,) that were taken out.
 
     All zooms are 1, and the rest is as it came, where the photos do not differ beyond what their corners' noise
-    explains, or where the markers alone do not solve.
+    explains, or where the markers alone do not solve. Markers that were read where none are leave the corners.
     """
     zooms, seen = np.ones(len(photos)), corners.seen
     solution: MarkerSolution | None = None
@@ -70,6 +71,13 @@ def settle_breathing(
         except SpecimapError:
             solution = None
             break
+        if turn == 0 and 0 < len(wrong := misread(corners, solution)) < len(corners.marker_ids):
+            corners = without(corners, wrong)
+            seen = corners.seen
+            solution = solve_from_markers(
+                seen, corners.marker_ids, photos[0].size, edge_mm=edge_mm, focal_px=focal_px,
+                start=start_without(solution, wrong),
+            )  # fmt: skip
         # The last solution is of the corners as they are handed on.
         found = estimate_breathing(solution.scene, solution.seen) if turn < SETTLING else None
         if found is None or (turn == 0 and found.significance < SIGNIFICANT):

@@ -20,12 +20,14 @@ from specimap.core.reconstruct.depth import (
     choose_pairs,
     match_pair,
     shared_share,
+    sight_angles,
 )
 from specimap.core.reconstruct.volume import Volume
 
 COARSE_PX = 256
 COARSE_PAIRS = 10
-LEAST_MAPS = 2
+LEAST_MAPS = 3
+"""Fusion keeps what so many maps show; see ``SurfaceSettings.least_weight``."""
 LEAST_MAPS_SHARE = 0.05
 """Of the pairs; with fewer, what a place shows rests on one pair alone."""
 LEAST_SHARED = 0.3
@@ -104,7 +106,8 @@ def dense_depth(
     pairs = choose_pairs(poses, volume.centre, settings)
     if len(pairs) < LEAST_MAPS:
         raise DepthNotFoundError(
-            f"No two of the {len(poses)} photos look at the markers from directions 4 to 42 degrees apart.",
+            f"{'Hardly any' if pairs else 'No'} two of the {len(poses)} photos look at the markers from directions "
+            "4 to 42 degrees apart.",
             advice="Take photos all around, neighbours 10 to 20 degrees apart and about equally far away.",
             photos=len(poses),
         )
@@ -125,14 +128,19 @@ def dense_depth(
                 maps.append(depth_map)
             progress(done / len(pairs))
     if len(maps) < max(LEAST_MAPS, LEAST_MAPS_SHARE * len(pairs)):
-        raise _not_found(lens, poses, volume, pairs, len(maps))
+        raise _not_found(lens, poses, volume, pairs, len(maps), settings.angle_deg[2])
     return maps
 
 
 def _not_found(
-    lens: Intrinsics, poses: tuple[Pose, ...], volume: Volume, pairs: list[tuple[int, int]], found: int
-) -> DepthNotFoundError:  # fmt: skip
-    """Why hardly a pair gave depth: they do not show the same, or nothing in them matches."""
+    lens: Intrinsics,
+    poses: tuple[Pose, ...],
+    volume: Volume,
+    pairs: list[tuple[int, int]],
+    found: int,
+    widest_deg: float,
+) -> DepthNotFoundError:
+    """Why hardly a pair gave depth: they do not show the same, look from too far apart, or nothing in them matches."""
     details = {"photos": len(poses), "pairs": len(pairs), "pairs_with_depth": found}
     apart = sum(shared_share(lens, poses[i], poses[j], volume.lattice) < LEAST_SHARED for i, j in pairs)
     if apart > len(pairs) / 2:
@@ -142,6 +150,15 @@ def _not_found(
             f"{apart} of {len(pairs)} pairs of neighbouring photos show too little in common: the cameras stood "
             f"{height:.0f} mm above markers that span {width:.0f} mm.",
             advice="Take the photos from farther away, so that each shows most of the markers with the specimen.",
+            **details,
+        )
+    apart_of = sight_angles(poses, volume.centre)
+    apart_deg = float(np.median([apart_of[i, j] for i, j in pairs]))
+    if apart_deg > widest_deg:
+        return DepthNotFoundError(
+            f"Neighbouring photos look at the markers from directions {apart_deg:.0f} degrees apart: too far for what "
+            f"one shows to be found in the other; {found} of {len(pairs)} pairs gave depth.",
+            advice="Take 20 or more photos all around, neighbours 10 to 20 degrees apart.",
             **details,
         )
     return DepthNotFoundError(

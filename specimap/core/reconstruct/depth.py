@@ -93,17 +93,21 @@ class DepthMap:
         return self.view(pose).cam_from_world.inverse().apply(cam)
 
 
+def sight_angles(poses: tuple[Pose, ...], target: Floats) -> Floats:
+    """Degrees (P, P) between the directions from which photos look at ``target`` (3,)."""
+    sight = np.stack([p.centre for p in poses]) - target
+    sight = sight / np.linalg.norm(sight, axis=1)[:, None]
+    return np.asarray(np.degrees(np.arccos(np.clip(sight @ sight.T, -1, 1))))
+
+
 def choose_pairs(poses: tuple[Pose, ...], target: Floats, settings: DepthSettings) -> list[tuple[int, int]]:
     """Ordered pairs (reference, other): for each photo its best neighbours in viewing angle.
 
     Linear in the number of photos. Where fewer than two neighbours lie within the usual angles (few photos),
     wider ones are taken, since a steep match is better than a hole.
     """
-    centres = np.stack([p.centre for p in poses])
-    sight = centres - target
-    distance = np.linalg.norm(sight, axis=1)
-    sight = sight / distance[:, None]
-    angle = np.degrees(np.arccos(np.clip(sight @ sight.T, -1, 1)))
+    distance = np.linalg.norm(np.stack([p.centre for p in poses]) - target, axis=1)
+    angle = sight_angles(poses, target)
     least, best, widest = settings.angle_deg
     pairs = []
     partners = settings.pairs_per_photo - (len(poses) >= settings.many_photos)
