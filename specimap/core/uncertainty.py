@@ -52,8 +52,8 @@ class Shares:
     which a sideways error turns into height.
     """
 
-    of_width: float = 0.0518
-    of_bend: float = 0.867
+    of_width: float = 0.0543
+    of_bend: float = 0.87
     of_jump: float = 0.416
 
 
