@@ -184,6 +184,16 @@ def test_a_marker_that_was_moved_is_no_false_reading() -> None:
     assert not misread(corners, solved(corners.seen, corners.marker_ids))
 
 
+def test_markers_of_photos_that_are_not_posed_are_no_false_readings() -> None:
+    """Photos of another scene must be told as that; some wait for features."""
+    _, seen = marker_scene(photos=10, markers=6, noise_px=0.1)
+    seen = seen.of((seen.photo < 8) == (seen.marker < 4))
+    corners = CornersInPhotos(seen, tuple(range(6)))
+    solution = solved(corners.seen, corners.marker_ids)
+    assert not {8, 9} & set(solution.photos)
+    assert not misread(corners, solution)
+
+
 def test_an_earlier_solution_leads_to_the_same_answer() -> None:
     """Corners that moved a little, and a photo and a marker that the earlier solution does not know."""
     truth, seen = marker_scene(seed=4)

@@ -83,6 +83,14 @@ def test_without_markers_nothing_is_told() -> None:
     assert at_own_resolution([], []) == ([], [])
 
 
+def test_a_photo_whose_markers_have_no_edge_is_left_out_of_account() -> None:
+    """Overexposed, a marker may read whose edges are no steps any more."""
+    plain, soft = photo(np.full(SHAPE, 90, np.uint8), "p"), photo(shown(1.8), "s")
+    found = detect_markers(soft.grey, "DICT_4X4_50")
+    assert own_resolution([plain], [found]) == 1
+    assert own_resolution([plain, soft], [found, found]) == own_resolution([soft], [found]) < 0.9
+
+
 def test_the_portrait_of_a_landscape_keeps_square_pixels() -> None:
     turned = [photo(np.ascontiguousarray(np.rot90(shown(0.9)))) for _ in range(2)]
     found = [detect_markers(p.grey, "DICT_4X4_50") for p in turned]

@@ -22,13 +22,12 @@ def misread(corners: CornersInPhotos, solution: MarkerSolution) -> set[int]:
 
     Dictionaries of few bits, ARUCO_ORIGINAL above all, read such ids here and there. A marker that was moved is none of
     them: the photos before agree on its place, and those after on another. Photos that the solution does not pose, as
-    they wait for features, are given the benefit.
+    they wait for features or show another scene, are given the benefit.
     """
     order = {photo: k for k, photo in enumerate(solution.photos)}
-    strange = [*solution.foreign, *solution.unconnected]
     found = set()
     for k, marker in enumerate(corners.marker_ids):
-        mine = corners.seen.of((corners.seen.marker == k) & ~np.isin(corners.seen.photo, strange))
+        mine = corners.seen.of(corners.seen.marker == k)
         if all(int(p) in order for p in mine.photo) and not _two_agree(mine, order, solution):
             found.add(marker)
     return found

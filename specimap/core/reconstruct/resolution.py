@@ -35,7 +35,9 @@ def own_resolution(photos: Sequence[Photo], detections: Sequence[list[Detection]
 
     def blur(photo: Photo, found: list[Detection]) -> float:
         squares = np.array([d.corners_px for d in found]).reshape(-1, 4, 2)
-        return float(np.nanmedian(edge_blurs(linear_from_srgb(photo.grey), squares))) if found else float("nan")
+        told = edge_blurs(linear_from_srgb(photo.grey), squares) if found else np.zeros(0)
+        told = told[np.isfinite(told)]  # none may be measurable where the photo is overexposed
+        return float(np.median(told)) if told.size else float("nan")
 
     with ThreadPoolExecutor(workers) as pool:
         blurs = np.array(list(pool.map(blur, photos, detections)))
