@@ -93,6 +93,8 @@ def test_light_size_and_markers(tmp_path: Path) -> None:
     assert verdict_of(at, jpeg(bare)) == "no_markers_found"
     others = Others(sizes=[(4000, 3000), (3000, 4000), (4000, 3000)])
     assert verdict_of(at, SHARP[0].read_bytes(), others=others) == "photo_foreign"
+    at.write_bytes(jpeg(np.ascontiguousarray(bgr(SHARP[0])[:, ::-1])))
+    assert "mirrored" in judge_photo(at, "DICT_4X4_50", Others()).reason
     assert verdict_of(at, SHARP[0].read_bytes(), "DICT_APRILTAG_36h11") == "marker_dictionary_wrong"
     judged = judge_photo(SHARP[0], "DICT_APRILTAG_36h11", Others())
     assert (judged.verdict, judged.facts["dictionary_seen"]) == ("doubtful", "DICT_4X4_1000")

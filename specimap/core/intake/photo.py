@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from specimap.core.acquisition import AcquisitionSettings, read_photo, same_shape
 from specimap.core.errors import NoMarkersFoundError, PhotoUnreadableError, WrongDictionaryError
-from specimap.core.fiducials import detect_markers, fitting_dictionaries
+from specimap.core.fiducials import detect_markers, fitting_dictionaries, shared_sightings
 from specimap.core.intake.verdict import Verdict
 from specimap.core.photofile import photo_suffix
 
@@ -123,12 +123,15 @@ def _markers(ids: list[int], grey: NDArray[np.uint8], dictionary: str) -> Verdic
         return Verdict(
             "doubtful", "few_markers", reason, "Take it again with two or more markers whole in the picture."
         )
-    if len(detect_markers(np.ascontiguousarray(grey[:, ::-1]), dictionary, expected=0)) >= LEAST_MARKERS:
+    # Twice at different sizes: texture that reads as a marker by chance does not do so again.
+    both = [grey, np.asarray(cv2.resize(grey, None, fx=0.75, fy=0.75), np.uint8)]
+    fitting = fitting_dictionaries(both)
+    mirrored = shared_sightings([np.ascontiguousarray(image[:, ::-1]) for image in both], dictionary)
+    # In dictionaries of few bits, mirror images of another one's markers read, too.
+    if mirrored > max([LEAST_MARKERS, *fitting.values()]):
         reason = f"It is mirrored: markers of {dictionary} read in its mirror image only."
         advice = "Take it again with the phone's rear camera, and do not flip it."
         return Verdict("doubtful", NoMarkersFoundError.code, reason, advice)
-    # Twice at different sizes: texture that reads as a marker by chance does not do so again.
-    fitting = fitting_dictionaries([grey, np.asarray(cv2.resize(grey, None, fx=0.75, fy=0.75), np.uint8)])
     if fitting:
         seen = next(iter(fitting))
         reason = f"Its markers are of {seen}, the acquisition's of {dictionary}."

@@ -161,13 +161,14 @@ def _refuse_unreadable(photos: list[Photo], rows: list[tuple[int, Detection]], d
     images = [photos[p].grey for p in few]
     many = DICTIONARY_FACTOR * max(sum(photo in few for photo, _ in rows), 1)
     mirrored = shared_sightings([np.ascontiguousarray(image[:, ::-1]) for image in images], dictionary)
-    if mirrored > many:
+    fitting = fitting_dictionaries(images)
+    # In dictionaries of few bits, mirror images of another one's markers read, too.
+    if mirrored > max([many, *fitting.values()]):
         raise NoMarkersFoundError(
             f"The photos are mirrored: markers of {dictionary} read in their mirror images only.",
             advice="Take the photos with the phone's rear camera, and do not flip them.",
             dictionary=dictionary,
         )
-    fitting = fitting_dictionaries(images)
     fitting = {name: seen for name, seen in fitting.items() if seen > many}
     if not fitting:
         return
