@@ -11,6 +11,7 @@ from cube_files import FILE_AXES, Values, random_values, write_envi
 
 from specimap.core.cube import inspect, open_cube
 from specimap.core.errors import CubeContentError
+from specimap.core.intake.cube import judge_cube
 
 # ---- wavelengths, bad bands, quantity -------------------------------------------------------------------
 
@@ -170,3 +171,10 @@ def test_content_warnings(tmp_path: Path) -> None:
 def test_nothing_usable(tmp_path: Path, value: float) -> None:
     with pytest.raises(CubeContentError):
         codes(tmp_path, np.full((6, 5, 4), value, "f4"))
+
+
+def test_a_refusal_speaks_of_the_file_as_what_it_is(tmp_path: Path) -> None:
+    np.save(tmp_path / "flat.npy", np.full((4, 5, 6), 7, np.uint16))
+    assert judge_cube(tmp_path / "flat.npy").reason == "All values of the cube are the same."
+    np.save(tmp_path / "complex.npy", np.zeros((4, 5, 6), np.complex64))
+    assert judge_cube(tmp_path / "complex.npy").reason.startswith("The cube holds values of type complex64")

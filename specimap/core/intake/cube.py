@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any, Literal
 
@@ -127,6 +128,8 @@ def _listed(warnings: Warnings) -> list[dict[str, str]]:
 
 def _refused(error: SpecimapError, path: Path, facts: dict[str, Any]) -> Verdict:
     facts = {**facts, **{k: v for k, v in error.details.items() if k in ("field", "expected_bytes", "found_bytes")}}
-    subject = "The header" if isinstance(error, CubeHeaderError) else "The cube"
-    reason = error.message.replace(str(path), subject).replace(path.name, subject)
+    subject = "header" if isinstance(error, CubeHeaderError) and is_envi_header(path) else "cube"
+    # Its name here is none that the sender gave.
+    named = re.escape(str(path)) + "|" + re.escape(path.name)
+    reason = re.sub(named, lambda at: f"{'the' if at.start() else 'The'} {subject}", error.message)
     return Verdict("refused", error.code, reason, error.advice, facts)
