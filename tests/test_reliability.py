@@ -66,9 +66,24 @@ def test_stated_deviations_hold_on_path_traced_tissue(data_dir: Path, tmp_path: 
     assert_near(shares_of(data_dir / "phantom_hard", tmp_path / "out"), 0.06, 0.04)
 
 
-def test_stated_deviations_hold_where_they_were_set(data_dir: Path, tmp_path: Path) -> None:
-    # One of seven that they were set on, and one of the sharpest: what is held tighter is their average.
-    assert_near(shares_of(data_dir / "phantom_a", tmp_path / "out"), 0.10, 0.06)
+@pytest.fixture(scope="module")
+def setter(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Shares:
+    """Shares on the path-traced phantom that has a part in setting sigma."""
+    return shares_of(data_dir / "phantom_a", tmp_path_factory.mktemp("setter") / "out")
+
+
+def test_stated_deviations_are_not_too_small_where_they_were_set(setter: Shares) -> None:
+    one, two = setter
+    assert one >= ONE - 0.06, setter
+    assert two >= TWO - 0.04, setter
+
+
+@pytest.mark.xfail(
+    strict=True, raises=AssertionError,
+    reason="sigma is too large there: 76.5 % within one, since the error fell by a sixth and sigma did not follow",
+)  # fmt: skip
+def test_stated_deviations_hold_where_they_were_set(setter: Shares) -> None:
+    assert_near(setter, 0.06, 0.04)
 
 
 def assert_near(shares: Shares, allowed_one: float, allowed_two: float) -> None:
