@@ -60,9 +60,17 @@ def bench_accuracy(console: Console, work: Path, repeats: int) -> dict[str, obje
     data = Path(value) if value else None
     table = Table(title="Position of the specimen's spectra against truth", title_justify="left")
     for heading in (
-        "acquisition", "photos used", "median mm", "p95 mm", "coverage", "scale", "2D corner mm", "3D corner mm",
-        "homography median / p95 mm", "seconds",
-    ):  # fmt: skip
+        "acquisition",
+        "photos used",
+        "median mm",
+        "p95 mm",
+        "coverage",
+        "scale",
+        "2D corner mm",
+        "3D corner mm",
+        "homography median / p95 mm",
+        "seconds",
+    ):
         first = heading == "acquisition"
         table.add_column(heading, justify="left" if first else "right", no_wrap=first)
     figures: dict[str, object] = {}
@@ -82,13 +90,23 @@ def bench_accuracy(console: Console, work: Path, repeats: int) -> dict[str, obje
         flat = judge(out, case.folder)
         said = run.result
         table.add_row(
-            case.name, f"{said['photos'][0]} of {said['photos'][1]}", f"{camera.median:.3f}", f"{camera.p95:.3f}",
-            f"{100 * camera.coverage:.1f} %", f"{100 * camera.scale:+.2f} %", f"{said['corner_2d_mm']:.3f}",
-            f"{said['corner_3d_mm']:.3f}", f"{flat.median:.3f} / {flat.p95:.3f}", f"{run.whole.wall_s:.1f}",
-        )  # fmt: skip
+            case.name,
+            f"{said['photos'][0]} of {said['photos'][1]}",
+            f"{camera.median:.3f}",
+            f"{camera.p95:.3f}",
+            f"{100 * camera.coverage:.1f} %",
+            f"{100 * camera.scale:+.2f} %",
+            f"{said['corner_2d_mm']:.3f}",
+            f"{said['corner_3d_mm']:.3f}",
+            f"{flat.median:.3f} / {flat.p95:.3f}",
+            f"{run.whole.wall_s:.1f}",
+        )
         figures[case.name] = {
-            "camera": _figures(camera), "homography": _figures(flat), "seconds": run.whole.wall_s, "report": said,
-        }  # fmt: skip
+            "camera": _figures(camera),
+            "homography": _figures(flat),
+            "seconds": run.whole.wall_s,
+            "report": said,
+        }
     console.print(table)
     if data is None:
         console.print("SPECIMAP_TEST_DATA is not set: only the sample was judged.")
@@ -104,6 +122,9 @@ def _measured(photos: Path, case: Case, out: Path, method: str) -> Measured:
 
 def _figures(found: TruthComparison) -> dict[str, float]:
     return {
-        "median_mm": found.median, "p95_mm": found.p95, "coverage": found.coverage, "scale": found.scale,
+        "median_mm": found.median,
+        "p95_mm": found.p95,
+        "coverage": found.coverage,
+        "scale": found.scale,
         "corner_mm": found.corner_mm,
-    }  # fmt: skip
+    }

@@ -75,9 +75,13 @@ def budget(folder: Path, scratch: Path) -> Iterator[Part]:
     images = [p.image for p in read_photos(paths, settings.acquisition, workers=workers)[0]]
     lens, poses, corners = scene.true_photos()
     maps = dense_depth(
-        [images[p] for p in stage1.reconstruction.photos], lens, poses, volume_over(corners, poses),
-        settings.reconstruct.depth, workers=workers,
-    )  # fmt: skip
+        [images[p] for p in stage1.reconstruction.photos],
+        lens,
+        poses,
+        volume_over(corners, poses),
+        settings.reconstruct.depth,
+        workers=workers,
+    )
     redone = mesh_of(tuple(maps), list(stage1.greys), lens, poses, corners, settings, workers=workers).mesh
     yield _judged(scene, "the photos' cameras and corners", redone, camera)
     yield _judged(scene, "all cameras", redone, scene.true_camera)

@@ -48,9 +48,16 @@ class _Steps:
 def settings_of(options: Namespace) -> PipelineSettings:
     """The published settings, with the markers that the options name."""
     return settings_from(
-        edge_mm=options.edge_mm, dictionary=options.dictionary, method=options.method, adjustment="rigid", r_pc=0.5,
-        r_reg=2.0, backend="colmap", features="auto", working_px=1280,
-    )  # fmt: skip
+        edge_mm=options.edge_mm,
+        dictionary=options.dictionary,
+        method=options.method,
+        adjustment="rigid",
+        r_pc=0.5,
+        r_reg=2.0,
+        backend="colmap",
+        features="auto",
+        working_px=1280,
+    )
 
 
 def _said(report: Report) -> dict[str, object]:

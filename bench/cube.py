@@ -45,10 +45,16 @@ def bench_cube(console: Console, work: Path, repeats: int) -> dict[str, object]:
         raw.unlink()
         shutil.rmtree(out)
         table.add_row(
-            f"{dtype} {interleave}", f"{gigabytes:.2f}", f"{best.wall_s:.2f}", f"{TARGET_S[dtype]:.0f}",
-            f"{best.cpu_s:.1f}", f"{best.peak_mb:.0f}", str(TARGET_MB), f"{bound['sum_s']:.2f}",
+            f"{dtype} {interleave}",
+            f"{gigabytes:.2f}",
+            f"{best.wall_s:.2f}",
+            f"{TARGET_S[dtype]:.0f}",
+            f"{best.cpu_s:.1f}",
+            f"{best.peak_mb:.0f}",
+            str(TARGET_MB),
+            f"{bound['sum_s']:.2f}",
             f"{100 * bound['sum_s'] / best.wall_s:.0f} %",
-        )  # fmt: skip
+        )
         kept = [m.as_dict() for m in runs]
         figures[f"{dtype}_{interleave}"] = {"bytes": gigabytes * 1e9, "bound": bound, "runs": kept}
     console.print(table)

@@ -36,9 +36,17 @@ PHOTOS = 16
 WITH_MARKERS = 4
 WORKERS = 2
 CASES = (
-    (1.0, 0.15, True), (0.5, 0.15, True), (0.25, 0.15, True), (0.1, 0.15, True), (0.25, 0.4, True), (0.25, 0.8, True),
-    (0.25, 0.8, False), (0.1, 0.8, False), (0.0, 0.15, False), (0.0, 0.8, False),
-)  # fmt: skip
+    (1.0, 0.15, True),
+    (0.5, 0.15, True),
+    (0.25, 0.15, True),
+    (0.1, 0.15, True),
+    (0.25, 0.4, True),
+    (0.25, 0.8, True),
+    (0.25, 0.8, False),
+    (0.1, 0.8, False),
+    (0.0, 0.15, False),
+    (0.0, 0.8, False),
+)
 """Texture contrast, gloss, and whether the cards show, unread, in the photos that features have to locate; where they
 do not, the tissue and the outline of its shadow are all that these photos share with the others."""
 VOXEL_MM = 0.3
@@ -79,10 +87,15 @@ def bench_features(console: Console, work: Path, repeats: int) -> dict[str, obje
         for kind in kinds:
             runs = [_run(photos, corners, truth, kind) for _ in range(repeats)]
             found = [r for r in runs if isinstance(r, Outcome)]
-            rows.append([
-                f"{texture:g}", f"{gloss:g}", "shown" if cards else "none", kind,
-                vars(min(found, key=lambda r: r.seconds)) if found else str(runs[0]),
-            ])  # fmt: skip
+            rows.append(
+                [
+                    f"{texture:g}",
+                    f"{gloss:g}",
+                    "shown" if cards else "none",
+                    kind,
+                    vars(min(found, key=lambda r: r.seconds)) if found else str(runs[0]),
+                ]
+            )
     figures: dict[str, object] = {"rows": rows}
     sheet_features(figures).show(console)
     if len(kinds) < len(KINDS):
@@ -94,18 +107,37 @@ def sheet_features(figures: dict[str, Any]) -> Sheet:
     """The table of kept figures."""
     sheet = Sheet(
         f"{PHOTOS} photos, markers read in {WITH_MARKERS} neighbours only; the rest by features",
-        ("texture", "gloss", "cards", "features", "photos posed", "pose, degrees", "pose, mm", "worst, mm",
-         "surface, mm", "seconds", "CPU s"),
-    )  # fmt: skip
+        (
+            "texture",
+            "gloss",
+            "cards",
+            "features",
+            "photos posed",
+            "pose, degrees",
+            "pose, mm",
+            "worst, mm",
+            "surface, mm",
+            "seconds",
+            "CPU s",
+        ),
+    )
     for *case, found in figures["rows"]:
         if isinstance(found, str):
             sheet.rows.append([*case, found, *[NONE] * 6])
             continue
         best = Outcome(**found)
-        sheet.rows.append([
-            *case, f"{best.photos} of {PHOTOS}", f"{best.deg:.2f}", f"{best.mm:.3f}", f"{best.worst_mm:.2f}",
-            f"{best.surface_mm:.3f}", f"{best.seconds:.1f}", f"{best.cpu_s:.1f}",
-        ])  # fmt: skip
+        sheet.rows.append(
+            [
+                *case,
+                f"{best.photos} of {PHOTOS}",
+                f"{best.deg:.2f}",
+                f"{best.mm:.3f}",
+                f"{best.worst_mm:.2f}",
+                f"{best.surface_mm:.3f}",
+                f"{best.seconds:.1f}",
+                f"{best.cpu_s:.1f}",
+            ]
+        )
     return sheet
 
 
@@ -122,9 +154,7 @@ def _read_in(near: list[int], photos: list[Photo]) -> CornersInPhotos:
     return CornersInPhotos(corners.seen.of(np.isin(corners.seen.photo, near)), corners.marker_ids)
 
 
-def _run(
-    photos: list[Photo], corners: CornersInPhotos, truth: Truth, kind: Literal["sift", "aliked"]
-) -> Outcome | str:
+def _run(photos: list[Photo], corners: CornersInPhotos, truth: Truth, kind: Literal["sift", "aliked"]) -> Outcome | str:
     start, cpu = time.perf_counter(), time.process_time()
     try:
         posed = pose_photos(photos, corners, ReconstructSettings(features=kind), workers=WORKERS)

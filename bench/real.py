@@ -24,9 +24,16 @@ WORKING_PX = 1280
 def bench_apple(console: Console, folder: Path) -> dict[str, object]:
     """42 phone photos of an apple on a printed board: stages 1 and 2."""
     settings = settings_from(
-        edge_mm=EDGE_MM, dictionary="DICT_7X7_1000", method="camera", adjustment="rigid", r_pc=0.5, r_reg=2.0,
-        backend="colmap", features="auto", working_px=WORKING_PX,
-    )  # fmt: skip
+        edge_mm=EDGE_MM,
+        dictionary="DICT_7X7_1000",
+        method="camera",
+        adjustment="rigid",
+        r_pc=0.5,
+        r_reg=2.0,
+        backend="colmap",
+        features="auto",
+        working_px=WORKING_PX,
+    )
     workers = os.cpu_count() or 1
     with tempfile.TemporaryDirectory() as scratch:
         store, clock = Outputs(Path(scratch)).store, Clock(lambda stage, share: None, lambda: False)
@@ -44,6 +51,10 @@ def bench_apple(console: Console, folder: Path) -> dict[str, object]:
         highlight=False,
     )
     return {
-        "photos": [used, given], "markers": markers, "edge_mm": [edges.mean, edges.std],
-        "rms_px": stage2.adjusted.rms_after_px, "seconds": seconds, "vertices": vertices,
-    }  # fmt: skip
+        "photos": [used, given],
+        "markers": markers,
+        "edge_mm": [edges.mean, edges.std],
+        "rms_px": stage2.adjusted.rms_after_px,
+        "seconds": seconds,
+        "vertices": vertices,
+    }

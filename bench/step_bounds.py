@@ -122,13 +122,14 @@ def record(options: Namespace) -> Recorded:
             cv2.aruco, "ArucoDetector", lambda *given: Recorder(detector(*given), "detectMarkers", found.detections)
         ),
         patch.object(
-            cv2, "StereoSGBM",
+            cv2,
+            "StereoSGBM",
             SimpleNamespace(create=lambda **given: Recorder(matcher.create(**given), "compute", found.pairs)),
         ),
         patch.object(stages, "fuse", fusing),
         patch.object(stages, "refine_mesh", refining),
         suppress(_RefinedError),
-    ):  # fmt: skip
+    ):
         prepare_folder(Path(scratch))
         settings, store = settings_of(options), Outputs(Path(scratch)).store
         clock = Clock(lambda stage, share: None, lambda: False)
@@ -186,9 +187,14 @@ def integration(fusion: tuple[Any, ...]) -> Bound:
     tries: list[Bound] = []
     for _ in range(TRIES):
         grid = o3d.t.geometry.VoxelBlockGrid(
-            ("tsdf", "weight", "color"), (core.float32, core.float32, core.float32), ((1,), (1,), (3,)),
-            voxel_mm, BLOCK_VOXELS, FIRST_BLOCKS, core.Device("CPU:0"),
-        )  # fmt: skip
+            ("tsdf", "weight", "color"),
+            (core.float32, core.float32, core.float32),
+            ((1,), (1,), (3,)),
+            voxel_mm,
+            BLOCK_VOXELS,
+            FIRST_BLOCKS,
+            core.Device("CPU:0"),
+        )
         spent = {"wall_s": 0.0, "cpu_s": 0.0}
         for one in maps:
             view = one.view(poses[one.photo])

@@ -60,8 +60,10 @@ def bench_steps(console: Console, work: Path, repeats: int) -> dict[str, object]
         best = min(runs, key=lambda m: m.whole.wall_s)
         bounds = {START: {"wall_s": imports["outside"]}} | bounds_of([*given, "--out", f"{out}_0"])
         figures["cases"][case.name] = {
-            "steps": steps_of(best), "bounds": bounds, "runs": [m.as_dict() for m in runs],
-        }  # fmt: skip
+            "steps": steps_of(best),
+            "bounds": bounds,
+            "runs": [m.as_dict() for m in runs],
+        }
     figures["load_after"] = load()
     for sheet in sheet_steps(figures):
         sheet.show(console)
@@ -128,10 +130,15 @@ def sheet_steps(figures: dict[str, Any]) -> list[Sheet]:
         for step, spent in case["steps"].items():
             bound = case["bounds"].get(step, {})
             beside = [cell for key in ("wall_s", "cpu_s") for cell in _beside(bound.get(key), spent[key])]
-            sheet.rows.append([
-                step, f"{spent['wall_s']:.2f}", f"{100 * spent['wall_s'] / whole:.1f} %",
-                NONE if step == END else f"{spent['cpu_s']:.2f}", *beside,
-            ])  # fmt: skip
+            sheet.rows.append(
+                [
+                    step,
+                    f"{spent['wall_s']:.2f}",
+                    f"{100 * spent['wall_s'] / whole:.1f} %",
+                    NONE if step == END else f"{spent['cpu_s']:.2f}",
+                    *beside,
+                ]
+            )
         cpu = sum(step["cpu_s"] for step in case["steps"].values())
         sheet.rows.append(["whole", f"{whole:.2f}", "100 %", f"{cpu:.2f}", *[NONE] * 4])
         sheets.append(sheet)

@@ -40,10 +40,14 @@ def enlarge(header: Path, rows: int = ROWS, cols: int = COLS, bands: int = BANDS
     large = [
         cv2.copyMakeBorder(
             cv2.resize(np.ascontiguousarray(small[..., b]), (width, rows), interpolation=cv2.INTER_LINEAR),
-            0, 0, side, cols - width - side, cv2.BORDER_REPLICATE,
+            0,
+            0,
+            side,
+            cols - width - side,
+            cv2.BORDER_REPLICATE,
         )
         for b in np.flatnonzero(~_useless(small))
-    ]  # fmt: skip
+    ]
     rng = np.random.default_rng(0)
     noise = (NOISE * rng.standard_normal((2 * rows, cols), dtype=np.float32)).astype(np.float32)
     values = np.empty((bands, rows, cols), np.uint16)

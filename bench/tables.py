@@ -48,8 +48,10 @@ def newest_record(part: str) -> dict[str, Any]:
 
 def short_table(figures: dict[str, Any]) -> str:
     """For the README."""
-    rows = ["| acquisition | photos used | median mm | p95 mm | coverage | `homography`: median, p95 mm |",
-            "|---|---|---|---|---|---|"]  # fmt: skip
+    rows = [
+        "| acquisition | photos used | median mm | p95 mm | coverage | `homography`: median, p95 mm |",
+        "|---|---|---|---|---|---|",
+    ]
     for name, case in _cases(figures):
         used, given = case["report"]["photos"]
         flat, best = case["homography"], case["camera"]
@@ -64,8 +66,11 @@ def short_table(figures: dict[str, Any]) -> str:
 
 def long_table(figures: dict[str, Any]) -> str:
     """For docs/accuracy.md."""
-    rows = ["| acquisition | photos used | median mm | p95 mm | coverage | scale | 2D corner mm | 3D corner mm "
-            "| `homography`: median, p95 mm |", "|---|---|---|---|---|---|---|---|---|"]  # fmt: skip
+    rows = [
+        "| acquisition | photos used | median mm | p95 mm | coverage | scale | 2D corner mm | 3D corner mm "
+        "| `homography`: median, p95 mm |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
     for name, case in _cases(figures):
         used, given = case["report"]["photos"]
         flat, best, said = case["homography"], case["camera"], case["report"]

@@ -1,6 +1,6 @@
 """Reduce a phantom's folder to the sample: all photos as they are, the cube cropped, some of its bands, its truth.
 
-    python samples/make_sample.py PHANTOM_FOLDER [TARGET_FOLDER]
+python samples/make_sample.py PHANTOM_FOLDER [TARGET_FOLDER]
 """
 
 from __future__ import annotations
@@ -38,8 +38,23 @@ def reduce_truth(source: Path, target: Path, photo_size: tuple[int, int]) -> Non
     ``photo_size``: width, height.
     """
     with np.load(source, allow_pickle=False) as z:
-        kept = {k: z[k] for k in ("marker_ids", "marker_corners", "marker_length", "rgb_K", "rgb_R", "rgb_t",
-                                  "rgb_dist", "rgb_files", "hsi_R", "hsi_t", "hsi_dist", "materials")}  # fmt: skip
+        kept = {
+            k: z[k]
+            for k in (
+                "marker_ids",
+                "marker_corners",
+                "marker_length",
+                "rgb_K",
+                "rgb_R",
+                "rgb_t",
+                "rgb_dist",
+                "rgb_files",
+                "hsi_R",
+                "hsi_t",
+                "hsi_dist",
+                "materials",
+            )
+        }
         K = z["hsi_K"].copy()
         K[:2, 2] -= [CROP_COLS.start, CROP_ROWS.start]
         xyz = z["hsi_xyz"][CROP_ROWS, CROP_COLS]

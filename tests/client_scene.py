@@ -36,9 +36,15 @@ def client_of(handler: Handler, **options: Any) -> Client:
 def problem(status: int, code: str, headers: dict[str, str] | None = None, **details: object) -> httpx.Response:
     """An error as the service answers it."""
     body = {
-        "type": f"urn:specimap:error:{code}", "title": code, "status": status, "code": code, "detail": "It is so.",
-        "advice": "Do otherwise.", "details": details, "correlation_id": "c0ffee00",
-    }  # fmt: skip
+        "type": f"urn:specimap:error:{code}",
+        "title": code,
+        "status": status,
+        "code": code,
+        "detail": "It is so.",
+        "advice": "Do otherwise.",
+        "details": details,
+        "correlation_id": "c0ffee00",
+    }
     media = {"Content-Type": "application/problem+json"}
     return httpx.Response(status, headers=media | (headers or {}), content=json.dumps(body).encode())
 
@@ -128,14 +134,24 @@ class TusService:
         state = "finished" if len(content) == size else "open"
         name = self.metadata[upload]["filename"]
         file = {
-            "id": "file_1", "role": self.metadata[upload]["role"], "label": f"label-of-{name}", "name": name,
-            "size": size, "sha256": hashlib.sha256(content).hexdigest(), "state": "accepted",
-            "judgement": self.verdict, "created_at": "2026-11-22T06:00:00Z",
-        }  # fmt: skip
+            "id": "file_1",
+            "role": self.metadata[upload]["role"],
+            "label": f"label-of-{name}",
+            "name": name,
+            "size": size,
+            "sha256": hashlib.sha256(content).hexdigest(),
+            "state": "accepted",
+            "judgement": self.verdict,
+            "created_at": "2026-11-22T06:00:00Z",
+        }
         answer = {
-            "id": upload, "state": state, "offset": len(content), "size": size, "error": None,
+            "id": upload,
+            "state": state,
+            "offset": len(content),
+            "size": size,
+            "error": None,
             "file": file if state == "finished" else None,
-        }  # fmt: skip
+        }
         return httpx.Response(200, json=answer)
 
 

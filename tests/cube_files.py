@@ -40,10 +40,15 @@ def write_envi(
     rows, cols, bands = values.shape
     dtype = values.dtype.newbyteorder(order)
     fields: dict[str, object] = {
-        "samples": cols, "lines": rows, "bands": bands, "header offset": offset,
-        "file type": "ENVI Standard", "data type": ENVI_CODES[values.dtype.str[1:]],
-        "interleave": interleave, "byte order": int(order == ">"),
-    }  # fmt: skip
+        "samples": cols,
+        "lines": rows,
+        "bands": bands,
+        "header offset": offset,
+        "file type": "ENVI Standard",
+        "data type": ENVI_CODES[values.dtype.str[1:]],
+        "interleave": interleave,
+        "byte order": int(order == ">"),
+    }
     if compress:
         fields["file compression"] = 1
     fields |= {key.replace("_", " "): value for key, value in extra.items()}

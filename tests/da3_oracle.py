@@ -59,12 +59,15 @@ def oracle(
         depth = gaussian_filter(depth, EDGE_PX) * (1 + noise * wave / wave.std()) * np.exp(rng.uniform(-3, 3))
         depths.append(rng.uniform(0.5, 1.5, depth.shape) if k in lost else depth)
     np.save(folder / "depth.npy", np.stack(depths).astype(np.float32))
-    return write_script(folder, f"""depth = np.load({str(folder / "depth.npy")!r})
+    return write_script(
+        folder,
+        f"""depth = np.load({str(folder / "depth.npy")!r})
 assert arrays["images"].shape == (*depth.shape, 3)
 for done, window in enumerate(request["windows"]):
     assert np.allclose(arrays["poses"][window[0]], np.eye(4))
     step("depth", (done + 1) / len(request["windows"]))
-return {{"depth": depth}}, {FACTS}""")  # fmt: skip
+return {{"depth": depth}}, {FACTS}""",
+    )
 
 
 def random_weights(folder: Path, home: Path) -> Path:
@@ -73,7 +76,12 @@ def random_weights(folder: Path, home: Path) -> Path:
     script.write_text(RANDOM_WEIGHTS)
     target = folder / "model.safetensors"
     run_child(
-        script, {"target": str(target)}, {}, name="weights", steps={}, progress=lambda share: None,
+        script,
+        {"target": str(target)},
+        {},
+        name="weights",
+        steps={},
+        progress=lambda share: None,
         extra_path=[home / "src"],
-    )  # fmt: skip
+    )
     return folder

@@ -50,9 +50,13 @@ class Reader:
         """Run the section's next block as a person types it, and give what it prints."""
         functions = "\n".join(re.findall(r"^\w+\(\) \{.*?\}$", PAGE.read_text("utf-8"), re.MULTILINE | re.DOTALL))
         done = subprocess.run(
-            ["bash", "-euo", "pipefail", "-c", f"{functions}\n{self.next(title, 'sh')}"], cwd=self.folder,
-            env={**os.environ, **self.variables}, capture_output=True, text=True, timeout=60,
-        )  # fmt: skip
+            ["bash", "-euo", "pipefail", "-c", f"{functions}\n{self.next(title, 'sh')}"],
+            cwd=self.folder,
+            env={**os.environ, **self.variables},
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
         assert done.returncode == status, done.stdout + done.stderr
         return done.stdout
 

@@ -30,29 +30,36 @@ def full_report(points: int, names: tuple[str, ...] = ("a.jpg", "b.jpg", "c.jpg"
     plain = report_of(points)
     left = LeaveOneOut(median=0.021, maximum=0.043, per_marker={"0": 0.02, "7": 0.03, "2": 0.01})
     own = plain.methods["camera"]
-    figures = MethodFigures(
-        corner_2d_mm=own.corner_2d_mm, corner_3d_mm=own.corner_3d_mm, leave_one_marker_out_mm=left
-    )
+    figures = MethodFigures(corner_2d_mm=own.corner_2d_mm, corner_3d_mm=own.corner_3d_mm, leave_one_marker_out_mm=left)
     photos = [
         PhotoCorners(
-            name=name, width_px=320, height_px=240, marker_ids=[0, 7],
+            name=name,
+            width_px=320,
+            height_px=240,
+            marker_ids=[0, 7],
             corners_px=[square(30, 30 + k), square(200, 150)],
             residuals_px=rng.normal(0, 0.1, (2, 8)).round(2).tolist(),
         )
         for k, name in enumerate(names)
-    ]  # fmt: skip
+    ]
     cube = CubeCorners(
-        rows=70, cols=53, marker_ids=[0, 7], corners_px=[square(4, 4, 8), square(35, 35, 8)],
+        rows=70,
+        cols=53,
+        marker_ids=[0, 7],
+        corners_px=[square(4, 4, 8), square(35, 35, 8)],
         residuals_px=rng.normal(0, 0.05, (2, 8)).round(2).tolist(),
-    )  # fmt: skip
+    )
     return plain.model_copy(
         update={
             "photos": plain.photos.model_copy(update={"given": len(names), "used": list(names)}),
-            "methods": {"camera": figures, "homography": figures}, "leave_one_marker_out_mm": left,
-            "photo_corners": photos, "cube_corners": cube,
-            "settings": {"adjust": {"edge_mm": 6.8}, "features": "auto"}, "inputs": {"cube": "ab" * 32},
+            "methods": {"camera": figures, "homography": figures},
+            "leave_one_marker_out_mm": left,
+            "photo_corners": photos,
+            "cube_corners": cube,
+            "settings": {"adjust": {"edge_mm": 6.8}, "features": "auto"},
+            "inputs": {"cube": "ab" * 32},
         }
-    )  # fmt: skip
+    )
 
 
 def folder_of(

@@ -192,7 +192,7 @@ def ways(told: dict[str, Any]) -> dict[str, Callable[[], object]]:
         "send to a queue": lambda: _queued(told["queue"]),
         "share memory": lambda: _called(LIBRARY.shmget(0x5EC1, 4096, 0o1600)),
         "make a namespace": lambda: _called(LIBRARY.unshare(0x10000000)),
-    }  # fmt: skip
+    }
 
 
 def tried(told: dict[str, Any]) -> dict[str, str]:

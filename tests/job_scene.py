@@ -24,20 +24,33 @@ def acquisition(database: Database, *, photos: int = 6, others: Sequence[str] = 
     with database.session() as session:
         session.add(
             Acquisition(
-                id=acquisition_id, specimen_id="S-1", accession_number=None, dictionary="DICT_4X4_50", edge_mm=edge_mm,
-                notes="", created_by="key_test",
+                id=acquisition_id,
+                specimen_id="S-1",
+                accession_number=None,
+                dictionary="DICT_4X4_50",
+                edge_mm=edge_mm,
+                notes="",
+                created_by="key_test",
             )
-        )  # fmt: skip
+        )
         session.flush()
         for label in labels:
             file_id, role = new_id("file"), label.split("-")[0].split(".")[0]
             session.add(
                 StoredFile(
-                    id=file_id, acquisition_id=acquisition_id, role=role, label=label, name=label, size=1, sha256="0",
-                    storage_key=f"acquisitions/{acquisition_id}/{file_id}", state="accepted", judgement={},
+                    id=file_id,
+                    acquisition_id=acquisition_id,
+                    role=role,
+                    label=label,
+                    name=label,
+                    size=1,
+                    sha256="0",
+                    storage_key=f"acquisitions/{acquisition_id}/{file_id}",
+                    state="accepted",
+                    judgement={},
                     created_by="key_test",
                 )
-            )  # fmt: skip
+            )
     return acquisition_id
 
 
@@ -49,10 +62,17 @@ def queued_job(database: Database, acquisition_id: str | None = None, webhook: d
         settings = JobSettings().on(session.get_one(Acquisition, owner))
         session.add(
             Job(
-                id=job_id, acquisition_id=owner, settings=settings, priority=5, state="queued", request_hash="",
-                correlation_id="", created_by="key_test", webhook=webhook,
+                id=job_id,
+                acquisition_id=owner,
+                settings=settings,
+                priority=5,
+                state="queued",
+                request_hash="",
+                correlation_id="",
+                created_by="key_test",
+                webhook=webhook,
             )
-        )  # fmt: skip
+        )
         append_event(session, job_id, "state", {"state": "queued", "starts": 0})
     return job_id
 

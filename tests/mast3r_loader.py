@@ -49,6 +49,8 @@ def run(request: dict[str, Any], arrays: dict[str, Any], step: Any) -> Any:
         return {}, {"same": same, "training": loaded.training, "tensors": len(loaded.state_dict())}
     images = importlib.import_module("dust3r.utils.image").load_images(request["photos"], size=512, square_ok=True)
     values = {f"image_{k}": image["img"][0].permute(1, 2, 0).numpy() for k, image in enumerate(images)}
-    ours = {f"ours_{k}": next(child.pairs_of(array[None], [(0, 0)]))[0]["img"][0].permute(1, 2, 0).numpy()
-            for k, array in enumerate(arrays.values())}  # fmt: skip
+    ours = {
+        f"ours_{k}": next(child.pairs_of(array[None], [(0, 0)]))[0]["img"][0].permute(1, 2, 0).numpy()
+        for k, array in enumerate(arrays.values())
+    }
     return {**values, **ours}, {"sizes": [np.shape(v) for v in values.values()]}

@@ -52,9 +52,9 @@ class Seen:
     @property
     def depth(self) -> NDArray[np.float32]:
         """(N, H, W) mm."""
-        return np.stack([
-            v.cam_from_world.apply(p.astype(float))[..., 2] for v, p in zip(self.views, self.points, strict=True)
-        ]).astype(np.float32)  # fmt: skip
+        return np.stack(
+            [v.cam_from_world.apply(p.astype(float))[..., 2] for v, p in zip(self.views, self.points, strict=True)]
+        ).astype(np.float32)
 
     @property
     def poses(self) -> Floats:
@@ -80,9 +80,13 @@ def see(folder: Path, settings: PhantomSettings, size_px: int) -> Seen:
         hits = phantom.scene.caster.cast(eye, rays)
         points.append((eye + rays * hits.distance[:, None]).reshape(height, width, 3))
     return Seen(
-        photos, corners_in_photos(photos, found, "DICT_4X4_50"), plan, np.stack([plan.apply(p.image) for p in photos]),
-        views, np.stack(points).astype(np.float32),
-    )  # fmt: skip
+        photos,
+        corners_in_photos(photos, found, "DICT_4X4_50"),
+        plan,
+        np.stack([plan.apply(p.image) for p in photos]),
+        views,
+        np.stack(points).astype(np.float32),
+    )
 
 
 def answer_of(
@@ -129,9 +133,12 @@ def reconstruct(
     monkeypatch.setenv("ANSWER", str(path))
     shares: list[float] = []
     found = Mast3rBackend(settings, SCRIPT).reconstruct(
-        seen.photos, seen.corners, ReconstructSettings(hold_to_markers=hold_to_markers), workers=2,
+        seen.photos,
+        seen.corners,
+        ReconstructSettings(hold_to_markers=hold_to_markers),
+        workers=2,
         progress=shares.append,
-    )  # fmt: skip
+    )
     assert list(settings.cache.iterdir()) == []
     assert shares == sorted(shares)
     assert 0.9 < shares[-1] <= 1

@@ -78,8 +78,10 @@ def put_result(
     cloud = Cloud.open(local / "cloud.zarr")
     write_mesh_ply(local / "mesh.ply", mesh_of(cloud))
     (local / "report.json").write_text(report.model_dump_json(indent=1), encoding="utf-8")
-    corners = {str(i): [[10.0 * i, 0, 0], [10.0 * i + 6.8, 0, 0], [10.0 * i + 6.8, -6.8, 0], [10.0 * i, -6.8, 0]]
-               for i in range(4)}  # fmt: skip
+    corners = {
+        str(i): [[10.0 * i, 0, 0], [10.0 * i + 6.8, 0, 0], [10.0 * i + 6.8, -6.8, 0], [10.0 * i, -6.8, 0]]
+        for i in range(4)
+    }
     (local / "corners.json").write_text(json.dumps(corners), encoding="utf-8")
     write_preview(cloud, local / "preview.png")
 
@@ -96,25 +98,47 @@ def put_result(
         if new_acquisition:
             session.add(
                 Acquisition(
-                    id=acquisition, specimen_id=specimen_id, accession_number=accession_number,
-                    dictionary="DICT_4X4_50", edge_mm=6.8, notes="", created_by="key_test",
+                    id=acquisition,
+                    specimen_id=specimen_id,
+                    accession_number=accession_number,
+                    dictionary="DICT_4X4_50",
+                    edge_mm=6.8,
+                    notes="",
+                    created_by="key_test",
                 )
-            )  # fmt: skip
+            )
             session.flush()
         session.add(
             Job(
-                id=job, acquisition_id=acquisition, settings={}, priority=5, state=state, stage=None, progress=1.0,
-                starts=1, request_hash="0" * 64, correlation_id="test", seconds={"register": 1.5},
-                started_at=utc_now(), finished_at=utc_now(), created_by="key_test",
+                id=job,
+                acquisition_id=acquisition,
+                settings={},
+                priority=5,
+                state=state,
+                stage=None,
+                progress=1.0,
+                starts=1,
+                request_hash="0" * 64,
+                correlation_id="test",
+                seconds={"register": 1.5},
+                started_at=utc_now(),
+                finished_at=utc_now(),
+                created_by="key_test",
             )
-        )  # fmt: skip
+        )
         session.flush()
         session.add(
             CloudRow(
-                id=cloud_id, job_id=job, acquisition_id=acquisition, prefix=prefix, points=cloud.n_points,
-                bands=cloud.bands, size=size, report=report.model_dump(mode="json"),
+                id=cloud_id,
+                job_id=job,
+                acquisition_id=acquisition,
+                prefix=prefix,
+                points=cloud.n_points,
+                bands=cloud.bands,
+                size=size,
+                report=report.model_dump(mode="json"),
             )
-        )  # fmt: skip
+        )
     return Result(cloud_id, job, acquisition, prefix, local, cube)
 
 
@@ -129,11 +153,17 @@ def put_label(running: Running, result: Result, name: str, values: Array) -> Non
     with running.database.session() as session:
         session.add(
             LabelVersion(
-                cloud_id=result.cloud_id, name=name, version=(session.scalar(layer) or 0) + 1,
-                kind="class" if values.dtype.kind in "iu" else "probability", classes=[], made_by={"name": "test"},
-                storage_prefix=prefix, sha256="0" * 64, created_by="key_test",
+                cloud_id=result.cloud_id,
+                name=name,
+                version=(session.scalar(layer) or 0) + 1,
+                kind="class" if values.dtype.kind in "iu" else "probability",
+                classes=[],
+                made_by={"name": "test"},
+                storage_prefix=prefix,
+                sha256="0" * 64,
+                created_by="key_test",
             )
-        )  # fmt: skip
+        )
     running.app.state.context.clouds.forget(result.cloud_id)
 
 
@@ -147,28 +177,43 @@ def mesh_of(cloud: Cloud) -> Mesh:
     triangles = np.concatenate([np.stack([at, at + 1, at + 20], 1), np.stack([at + 1, at + 21, at + 20], 1)])
     normals = np.tile([0.0, 0.0, 1.0], (len(vertices), 1))
     colours = np.full((len(vertices), 3), (180, 90, 90), np.uint8)
-    return Mesh(
-        vertices.astype(np.float32), triangles.astype(np.int32), normals.astype(np.float32), colours
-    )  # fmt: skip
+    return Mesh(vertices.astype(np.float32), triangles.astype(np.int32), normals.astype(np.float32), colours)
 
 
 def report_of(points: int) -> Report:
     """A whole report; only its shape matters."""
     spread, quartiles = Spread(mean=0.1, std=0.05, n=16), Quartiles(median=0.1, q1=0.05, q3=0.15, n=16)
     return Report(
-        specimap_version="0", created="2026-01-01T00:00:00Z", method="camera", backend="colmap", adjustment="joint",
-        marker_ids=[0, 1, 2, 3], marker_ids_in_cube=[0, 1, 2, 3], corner_2d_mm=spread, corner_3d_mm=quartiles,
+        specimap_version="0",
+        created="2026-01-01T00:00:00Z",
+        method="camera",
+        backend="colmap",
+        adjustment="joint",
+        marker_ids=[0, 1, 2, 3],
+        marker_ids_in_cube=[0, 1, 2, 3],
+        corner_2d_mm=spread,
+        corner_3d_mm=quartiles,
         leave_one_marker_out_mm=None,
         methods={"camera": MethodFigures(corner_2d_mm=spread, corner_3d_mm=quartiles, leave_one_marker_out_mm=None)},
-        edge_length_mm=EdgeLength(expected=6.8, mean=6.8, std=0.01, n=16), corner_sigma_mm=0.01,
+        edge_length_mm=EdgeLength(expected=6.8, mean=6.8, std=0.01, n=16),
+        corner_sigma_mm=0.01,
         reprojection_px=Reprojection(before=0.5, after=0.2),
         photos=Photos(given=3, used=["photo-0001.jpg", "photo-0002.jpg", "photo-0003.jpg"], refused=[]),
         inliers=Inliers(n=16, of=16, threshold_px=3, threshold_mm=6),
         coverage=Coverage(between_markers=0.98, points=points, specimen_points=points // 2),
-        parallax_removed_mm=Parallax(median=0.4, maximum=2.0), sigma_mm=SigmaFigures(median=0.1, p95=0.3),
+        parallax_removed_mm=Parallax(median=0.4, maximum=2.0),
+        sigma_mm=SigmaFigures(median=0.1, p95=0.3),
         cube_camera=CubeCameraFigures(
-            focal_px=1200, focal_relative_sd=0.01, distance_mm=300, reprojection_rms_px=0.2, roll_deg=1, mirrored=False,
+            focal_px=1200,
+            focal_relative_sd=0.01,
+            distance_mm=300,
+            reprojection_rms_px=0.2,
+            roll_deg=1,
+            mirrored=False,
             markers_found_in="mean",
         ),
-        photo_focal_px=1500, seconds={"register": 1.5}, reused_stages=[], warnings=[],
-    )  # fmt: skip
+        photo_focal_px=1500,
+        seconds={"register": 1.5},
+        reused_stages=[],
+        warnings=[],
+    )

@@ -22,9 +22,7 @@ from specimap.core.report import Report
 from specimap.core.solver import MarkerScene, Observations, corners_of
 from specimap.core.surface import Mesh, vertex_normals
 
-SMALL = PhantomSettings(
-    photos=12, photo_size=384, cube_rows=128, cube_cols=160, bands=16, mesh_divisions=64
-)  # fmt: skip
+SMALL = PhantomSettings(photos=12, photo_size=384, cube_rows=128, cube_cols=160, bands=16, mesh_divisions=64)
 EDGE_MM = 6.8
 
 

@@ -134,8 +134,10 @@ def test_what_is_no_photo_is_refused_by_name(tmp_path: Path) -> None:
 
 def test_random_damage_never_gets_through_as_another_error(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    sources = [save(tmp_path / f"whole{s}", pattern(), Orientation=6, SubjectDistance=0.3).read_bytes()
-               for s in (".jpg", ".png", ".tif")]  # fmt: skip
+    sources = [
+        save(tmp_path / f"whole{s}", pattern(), Orientation=6, SubjectDistance=0.3).read_bytes()
+        for s in (".jpg", ".png", ".tif")
+    ]
     for k in range(60):
         data = bytearray(sources[k % 3])
         for at in rng.integers(0, min(len(data), 400), 6):
@@ -168,8 +170,10 @@ def test_bad_photos_among_good_ones_are_left_out(tmp_path: Path) -> None:
     photos, refused = read_photos(photo_paths(tmp_path), SETTINGS, progress=heard.append)
     assert [p.name for p in photos] == [f"good{k}.jpg" for k in range(4)]
     assert {r.name: r.code for r in refused} == {
-        "good0_copy.jpg": "photo_duplicate", "text.jpg": "photo_unreadable", "other_camera.jpg": "photo_foreign",
-    }  # fmt: skip
+        "good0_copy.jpg": "photo_duplicate",
+        "text.jpg": "photo_unreadable",
+        "other_camera.jpg": "photo_foreign",
+    }
     assert heard[-1] == 1.0
 
 

@@ -17,9 +17,7 @@ from specimap.core.geometry import Pose
 from specimap.core.reconstruct.features import FeatureKind, Features, aliked_missing, feature_kind
 from specimap.core.reconstruct.locating import Locator
 
-needs_aliked = pytest.mark.skipif(
-    bool(aliked_missing()), reason="the packages of make learned are not installed"
-)
+needs_aliked = pytest.mark.skipif(bool(aliked_missing()), reason="the packages of make learned are not installed")
 TARGET = np.array([0.0, 0.0, 3.0])
 PHOTO = 5
 NEIGHBOURS = (3, 4, 6, 7)

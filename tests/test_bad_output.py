@@ -60,8 +60,9 @@ def test_output_folders_that_cannot_be_used(small: OnDisk, tmp_path: Path) -> No
     assert "m\ufffdller" in str(refusal["message"])
     assert not latin.parent.exists()
     assert run_refused(small.photos, small.header, Path("/proc/specimap"))["code"] in (
-        "output_not_writable", "not_found",
-    )  # fmt: skip
+        "output_not_writable",
+        "not_found",
+    )
 
 
 @pytest.mark.parametrize(("number", "code"), [(errno.ENOSPC, "storage_full"), (errno.EACCES, "output_not_writable")])
@@ -141,5 +142,8 @@ def test_every_refusal_is_a_specimap_error() -> None:
     error = PhotosNotConnectedError("m", advice="a", photos=["x"])
     assert isinstance(error, SpecimapError)
     assert error.as_dict() == {
-        "code": "photos_not_connected", "message": "m", "advice": "a", "details": {"photos": ["x"]},
-    }  # fmt: skip
+        "code": "photos_not_connected",
+        "message": "m",
+        "advice": "a",
+        "details": {"photos": ["x"]},
+    }

@@ -136,9 +136,12 @@ def test_a_few_foreign_and_bad_photos_are_refused_by_name(
     assert refused.pop("stranger.jpg") in ("photo_foreign", "photo_unlocated")
     # Of two copies the one that comes first by name stays.
     assert refused == {
-        "other.jpg": "photo_foreign", "view_000.jpg": "photo_duplicate", "letter.jpg": "photo_unreadable",
-        "cut.jpg": "photo_unreadable", "bomb.png": "photo_unreadable",
-    }  # fmt: skip
+        "other.jpg": "photo_foreign",
+        "view_000.jpg": "photo_duplicate",
+        "letter.jpg": "photo_unreadable",
+        "cut.jpg": "photo_unreadable",
+        "bomb.png": "photo_unreadable",
+    }
 
 
 def without_markers(path: Path, phantom: OnDisk) -> None:
@@ -250,8 +253,9 @@ def test_a_layout_of_one_marker_is_refused_at_the_cube(tmp_path: Path) -> None:
 
 def test_other_layouts_work(tmp_path: Path) -> None:
     """Nine markers of another dictionary and edge."""
-    settings = replace(SMALL, marker_ids=tuple(range(20, 29)), dictionary="DICT_6X6_250", edge_mm=10.0, bands=4,
-                       photo_size=512)  # fmt: skip
+    settings = replace(
+        SMALL, marker_ids=tuple(range(20, 29)), dictionary="DICT_6X6_250", edge_mm=10.0, bands=4, photo_size=512
+    )
     phantom = phantom_on_disk(tmp_path, settings)
     pipeline = PipelineSettings()
     pipeline = replace(
@@ -265,9 +269,13 @@ def test_other_layouts_work(tmp_path: Path) -> None:
     cloud = Cloud.open(tmp_path / "out" / "cloud.zarr")
     true_corners = phantom.truth.marker_corners[[list(settings.marker_ids).index(i) for i in ids]]
     against = compare_with_truth(
-        cloud.hsi_pixel, cloud.xyz, corners, true_corners, phantom.truth.hsi_xyz.astype(float),
+        cloud.hsi_pixel,
+        cloud.xyz,
+        corners,
+        true_corners,
+        phantom.truth.hsi_xyz.astype(float),
         phantom.truth.hsi_class == 1,
-    )  # fmt: skip
+    )
     assert 0.01 < against.median < 0.4
     assert abs(against.scale) < 0.005
     assert report.edge_length_mm.mean == pytest.approx(10, rel=0.01)

@@ -129,9 +129,13 @@ def test_steps_rest_and_ends_add_up_to_the_run() -> None:
     run = Measured(
         {"start": Cost(1.0, 0.9), "reconstruct": Cost(4.0, 6.0), "adjust": Cost(2.0, 3.0)},
         Cost(7.5, 9.9),
-        {"steps": {"fusion": {"wall_s": 1.5, "cpu_s": 2.5, "calls": 1},
-                   "reading photos": {"wall_s": 3.0, "cpu_s": 5.0, "calls": 1}}},
-    )  # fmt: skip
+        {
+            "steps": {
+                "fusion": {"wall_s": 1.5, "cpu_s": 2.5, "calls": 1},
+                "reading photos": {"wall_s": 3.0, "cpu_s": 5.0, "calls": 1},
+            }
+        },
+    )
     steps = steps_of(run)
     assert list(steps) == [START, "reading photos", "fusion", REST, END]
     assert steps[REST] == pytest.approx({"wall_s": 1.5, "cpu_s": 1.5})

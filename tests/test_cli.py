@@ -23,8 +23,11 @@ PROGRAM = [sys.executable, "-c", "from specimap.cli import main; main()"]
 def started(small: OnDisk, out: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [*PROGRAM, "run", "--photos", str(small.photos), "--cube", str(small.header), "--out", str(out), "--json"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, "OMP_NUM_THREADS": "2"},
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "2"},
+    )
 
 
 def read_until(process: subprocess.Popen[str], stage: str, share: float) -> None:
@@ -91,9 +94,7 @@ def test_the_same_run_again_repeats_nothing(finished: Finished, small: OnDisk, t
 
 
 @pytest.mark.parametrize("r_pc", ["0.05", "1.0"])
-def test_another_grid_repeats_stages_3_and_4_only(
-    finished: Finished, small: OnDisk, tmp_path: Path, r_pc: str
-) -> None:
+def test_another_grid_repeats_stages_3_and_4_only(finished: Finished, small: OnDisk, tmp_path: Path, r_pc: str) -> None:
     out = finished.copy_to(tmp_path / "out")
     answer = specimap("run", "--photos", small.photos, "--cube", small.header, "--out", out, "--r-pc", r_pc, "--json")
     assert answer.status == 0

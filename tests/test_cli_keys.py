@@ -40,8 +40,11 @@ def test_key_is_made_before_the_first_start_and_opens_the_service(tmp_path: Path
     assert key not in done.stderr
     (row,) = listed(tmp_path, any_database)
     assert {name: row[name] for name in ("name", "scopes", "state", "last_used_at")} == {
-        "name": "tablet 3", "scopes": ["upload", "read"], "state": "valid", "last_used_at": None,
-    }  # fmt: skip
+        "name": "tablet 3",
+        "scopes": ["upload", "read"],
+        "state": "valid",
+        "last_used_at": None,
+    }
     assert key not in json.dumps(row)
     with serving(tmp_path, database_url=any_database) as service:
         client = service.client(["read"])

@@ -93,11 +93,17 @@ def test_spectra_in_some_bands_and_in_pages(live: Live, form: str) -> None:
 @pytest.mark.parametrize(
     "wrong",
     [
-        {}, {"indices": [1], "pixels": [(1, 1)]}, {"indices": [True, False]}, {"indices": [1.5]}, {"pixels": [1, 2]},
-        {"indices": [1], "nm": (1, 2)}, {"indices": [1], "bands": [7]}, {"indices": [1], "bands": [1], "nm": (1, 2)},
+        {},
+        {"indices": [1], "pixels": [(1, 1)]},
+        {"indices": [True, False]},
+        {"indices": [1.5]},
+        {"pixels": [1, 2]},
+        {"indices": [1], "nm": (1, 2)},
+        {"indices": [1], "bands": [7]},
+        {"indices": [1], "bands": [1], "nm": (1, 2)},
         {"radius": ((1, 2), 3)},
     ],
-)  # fmt: skip
+)
 def test_selections_that_cannot_be_meant_are_refused_here(live: Live, wrong: _spectra.Selection) -> None:
     with pytest.raises(ValueError, match=r"give|numbers|shape|no such band|coordinates"):
         live.cloud.spectra(**wrong)

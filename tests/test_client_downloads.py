@@ -108,9 +108,11 @@ def test_without_a_strong_tag_all_is_read_again(tmp_path: Path, waits: list[floa
 
 def test_keys_of_chunks_follow_from_the_metadata() -> None:
     metadata = {
-        "node_type": "array", "shape": [300_000, 7], "chunk_key_encoding": {"name": "default"},
+        "node_type": "array",
+        "shape": [300_000, 7],
+        "chunk_key_encoding": {"name": "default"},
         "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [131_072, 7]}},
-    }  # fmt: skip
+    }
     assert list(chunk_keys(metadata)) == ["c/0/0", "c/1/0", "c/2/0"]
     assert list(chunk_keys({"node_type": "group"})) == []
     for wrong in ({"node_type": "array"}, metadata | {"chunk_key_encoding": {"name": "v2"}}):

@@ -54,8 +54,10 @@ def test_example_labels_a_cloud_as_well_as_can_be(service: Running, tmp_path: Pa
         seen = np.where(np.arange(len(truth[0])) % 2, truth[0], 0)
         client.clouds.get(results[0].cloud_id).put_label("histology", seen, classes=classes, made_by="a person")
         environment = os.environ | {
-            "SPECIMAP_URL": service.url, "SPECIMAP_KEY": service.key(["read", "label"]), "NO_PROXY": "127.0.0.1"
-        }  # fmt: skip
+            "SPECIMAP_URL": service.url,
+            "SPECIMAP_KEY": service.key(["read", "label"]),
+            "NO_PROXY": "127.0.0.1",
+        }
         command = [sys.executable, str(EXAMPLE), results[0].cloud_id, results[1].cloud_id]
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
         assert done.returncode == 0, done.stderr
@@ -86,8 +88,10 @@ class Always:
 def test_guide_does_what_it_says(service: Running, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     result = put_result(service, tmp_path / "result")
     for name, value in (
-        ("SPECIMAP_URL", service.url), ("SPECIMAP_KEY", service.key(["read", "label"])), ("NO_PROXY", "127.0.0.1"),
-    ):  # fmt: skip
+        ("SPECIMAP_URL", service.url),
+        ("SPECIMAP_KEY", service.key(["read", "label"])),
+        ("NO_PROXY", "127.0.0.1"),
+    ):
         monkeypatch.setenv(name, value)
     client_part, zarr_part = GUIDE.read_text("utf-8").split("## With a Zarr reader")
     names: dict[str, object] = {"cloud_id": result.cloud_id, "model": Always()}

@@ -13,10 +13,23 @@ from client_scene import KEY, answers, client_of, problem
 from specimap_client import Retries
 
 JOB: dict[str, Any] = {
-    "id": "job_1", "acquisition_id": "acq_1", "settings": {}, "priority": "routine", "state": "queued", "stage": None,
-    "progress": 0, "error": None, "starts": 0, "rerun_of": None, "cloud_id": None, "seconds": {},
-    "created_at": "2026-11-22T06:00:00Z", "started_at": None, "finished_at": None, "queue_position": 1,
-}  # fmt: skip
+    "id": "job_1",
+    "acquisition_id": "acq_1",
+    "settings": {},
+    "priority": "routine",
+    "state": "queued",
+    "stage": None,
+    "progress": 0,
+    "error": None,
+    "starts": 0,
+    "rerun_of": None,
+    "cloud_id": None,
+    "seconds": {},
+    "created_at": "2026-11-22T06:00:00Z",
+    "started_at": None,
+    "finished_at": None,
+    "queue_position": 1,
+}
 REFUSED = httpx.ConnectError("connection refused")
 BROKEN = httpx.ReadError("connection reset")
 
@@ -103,10 +116,17 @@ def test_certificate_that_is_not_trusted_is_told_at_once(waits: list[float]) -> 
 @pytest.mark.parametrize(
     ("status", "leaf"),
     [
-        (401, sc.Unauthorized), (403, sc.Forbidden), (404, sc.NotFound), (409, sc.Conflict), (412, sc.Conflict),
-        (413, sc.Refused), (422, sc.Refused), (500, sc.ServerError), (507, sc.ServerError),
+        (401, sc.Unauthorized),
+        (403, sc.Forbidden),
+        (404, sc.NotFound),
+        (409, sc.Conflict),
+        (412, sc.Conflict),
+        (413, sc.Refused),
+        (422, sc.Refused),
+        (500, sc.ServerError),
+        (507, sc.ServerError),
     ],
-)  # fmt: skip
+)
 def test_errors_have_types_and_carry_what_was_said(waits: list[float], status: int, leaf: type[sc.ApiError]) -> None:
     handler, seen = answers(problem(status, "some_code", scope="label"))
     with client_of(handler) as client, pytest.raises(sc.ApiError) as caught:

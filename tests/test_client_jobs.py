@@ -63,9 +63,12 @@ def test_wait_follows_the_stream(waits: list[float]) -> None:
         job = client.jobs.wait("job_1", progress=heard.append)
     assert (job.state, job.cloud_id) == ("succeeded", "cloud_1")
     assert [(j.state, j.stage, j.progress) for j in heard] == [
-        ("queued", None, 0.0), ("running", None, 0.0), ("running", "render", 0.5), ("succeeded", "render", 0.5),
+        ("queued", None, 0.0),
+        ("running", None, 0.0),
+        ("running", "render", 0.5),
+        ("succeeded", "render", 0.5),
         ("succeeded", None, 1.0),
-    ]  # fmt: skip
+    ]
     assert waits == []
 
 
@@ -116,8 +119,11 @@ def test_stream_that_is_held_back_is_replaced_by_asking(waits: list[float]) -> N
         assert client.jobs.wait("job_1", progress=heard.append).state == "succeeded"
     assert len(service.resumed) == 2
     assert [(j.state, j.progress) for j in heard] == [
-        ("queued", 0.0), ("running", 0.25), ("running", 0.0), ("succeeded", 1.0)
-    ]  # fmt: skip
+        ("queued", 0.0),
+        ("running", 0.25),
+        ("running", 0.0),
+        ("succeeded", 1.0),
+    ]
 
 
 def test_page_instead_of_a_stream_is_replaced_by_asking(waits: list[float]) -> None:
@@ -178,10 +184,26 @@ def test_rerun_and_cancel_and_log(waits: list[float]) -> None:
 @pytest.mark.parametrize("cut", [1, 2, 3, 7, 1000])
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
 def test_stream_is_read_wherever_it_is_cut(cut: int, end: str) -> None:
-    text = end.join([
-        "retry: 3000", "", ": comment", "event: log", 'data: {"a":', 'data: "é"}', "id: 7", "", "data: {}", "",
-        "id:8", "event:state", 'data:{"state":"running"}', "", "id: 9", "data: {}",
-    ])  # fmt: skip
+    text = end.join(
+        [
+            "retry: 3000",
+            "",
+            ": comment",
+            "event: log",
+            'data: {"a":',
+            'data: "é"}',
+            "id: 7",
+            "",
+            "data: {}",
+            "",
+            "id:8",
+            "event:state",
+            'data:{"state":"running"}',
+            "",
+            "id: 9",
+            "data: {}",
+        ]
+    )
     content = text.encode()
     events = list(_events.parse(content[i : i + cut] for i in range(0, len(content), cut)))
     # The second has no id, the last is not ended: neither is an event.

@@ -23,12 +23,43 @@ SOURCES = sorted((CLIENT / "src").rglob("*.py"))
 
 def test_public_names() -> None:
     assert sorted(sc.__all__) == [
-        "Acquisition", "ApiError", "Client", "Cloud", "Conflict", "ConnectionFailed", "Event", "Export", "ExportFailed",
-        "Failure", "File", "Forbidden", "Job", "JobFailed", "Key", "Label", "LabelClass", "LogLine", "MissingExtra",
-        "NewKey", "NotConfigured", "NotFound", "Point", "Progress", "RateLimited", "Refused", "Report", "Retries",
-        "ServerError", "SpecimapClientError", "Spectra", "Timeout", "Unauthorized", "UnexpectedAnswer", "UploadFailed",
+        "Acquisition",
+        "ApiError",
+        "Client",
+        "Cloud",
+        "Conflict",
+        "ConnectionFailed",
+        "Event",
+        "Export",
+        "ExportFailed",
+        "Failure",
+        "File",
+        "Forbidden",
+        "Job",
+        "JobFailed",
+        "Key",
+        "Label",
+        "LabelClass",
+        "LogLine",
+        "MissingExtra",
+        "NewKey",
+        "NotConfigured",
+        "NotFound",
+        "Point",
+        "Progress",
+        "RateLimited",
+        "Refused",
+        "Report",
+        "Retries",
+        "ServerError",
+        "SpecimapClientError",
+        "Spectra",
+        "Timeout",
+        "Unauthorized",
+        "UnexpectedAnswer",
+        "UploadFailed",
         "__version__",
-    ]  # fmt: skip
+    ]
     public = {path.stem for path in SOURCES if not path.stem.startswith("_")}
     assert public == {"progress"}
     named = {name for name in vars(sc) if not name.startswith("_")} - {"progress"}
@@ -90,9 +121,14 @@ def test_extras_are_asked_for_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "specimap_client._zarr", raising=False)
     monkeypatch.delitem(sys.modules, "specimap_client.progress", raising=False)
     summary = {
-        "id": "c", "job_id": "j", "acquisition_id": "a", "points": 1, "bands": 1, "size": 1,
+        "id": "c",
+        "job_id": "j",
+        "acquisition_id": "a",
+        "points": 1,
+        "bands": 1,
+        "size": 1,
         "created_at": "2026-11-22T06:00:00Z",
-    }  # fmt: skip
+    }
     with sc.Client("https://specimap.test", "spk_x") as client:
         cloud = sc.Cloud(client._session, summary)
         for use in (cloud.zarr, cloud.xarray, lambda: cloud.xyz):

@@ -188,8 +188,12 @@ def test_envi_header_brings_its_data(tmp_path: Path) -> None:
     with client_of(service) as client:
         files = client.acquisitions.upload("acq_1", cube=header, white=(data,), dark=[header, data])
     assert [(file.role, file.name) for file in files] == [
-        ("cube", "Scan.HDR"), ("cube", "scan.raw"), ("white", "scan.raw"), ("dark", "Scan.HDR"), ("dark", "scan.raw"),
-    ]  # fmt: skip
+        ("cube", "Scan.HDR"),
+        ("cube", "scan.raw"),
+        ("white", "scan.raw"),
+        ("dark", "Scan.HDR"),
+        ("dark", "scan.raw"),
+    ]
     (tmp_path / "scan.img").write_bytes(b"1234")
     with client_of(service) as client, pytest.raises(sc.UploadFailed, match="Several"):
         client.acquisitions.upload("acq_1", cube=header)

@@ -257,6 +257,6 @@ def test_the_writers_own_disk_error_is_typed(tmp_path: Path) -> None:
     here = Path(__file__).parent
     done = subprocess.run(
         [sys.executable, "-c", _FILE_TOO_LARGE, str(tmp_path)], cwd=here, capture_output=True, text=True, check=False
-    )  # fmt: skip
+    )
     assert done.stdout.startswith("full:"), done.stderr
     assert list(tmp_path.iterdir()) == []

@@ -105,9 +105,17 @@ def test_a_white_of_another_exposure_is_noticed(tmp_path: Path, share: float, sa
 
 @pytest.mark.parametrize(
     ("of_white", "of_raw", "said"),
-    [("9.96", "9.96", False), ("10.0", "9.96", False), ("2.0", "10.0", True), ("2 ms", "10 ms", True),
-     ("", "10", False), ("{1, 2}", "10", False), ("0", "10", False), ("auto", "10", False)],
-)  # fmt: skip
+    [
+        ("9.96", "9.96", False),
+        ("10.0", "9.96", False),
+        ("2.0", "10.0", True),
+        ("2 ms", "10 ms", True),
+        ("", "10", False),
+        ("{1, 2}", "10", False),
+        ("0", "10", False),
+        ("auto", "10", False),
+    ],
+)
 def test_an_exposure_that_differs_is_said(tmp_path: Path, of_white: str, of_raw: str, said: bool) -> None:
     values = random_values("u2", (4, 5, 11)) // 20 + 100
     raw = write_envi(tmp_path / "raw.hdr", values, tint=of_raw)

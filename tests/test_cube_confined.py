@@ -64,9 +64,15 @@ def check_nothing_leaks(path: Path, **references: Path) -> SpecimapError | None:
 
 def _all_of(cube: Cube) -> list[Any]:
     return [
-        cube.read_rows(0, cube.rows), cube.wavelengths_nm, cube.bad_bands, cube.mean_image(),
-        cube.warnings, repr(cube), cube.quantity, cube.fingerprint(),
-    ]  # fmt: skip
+        cube.read_rows(0, cube.rows),
+        cube.wavelengths_nm,
+        cube.bad_bands,
+        cube.mean_image(),
+        cube.warnings,
+        repr(cube),
+        cube.quantity,
+        cube.fingerprint(),
+    ]
 
 
 # ---- HDF5 -----------------------------------------------------------------------------------------------
@@ -114,14 +120,26 @@ def endless_virtual(f: h5py.File, name: str, shape: tuple[int, ...], secret: Pat
 
 
 WAYS = [
-    external_storage, relative_storage, storage_with_prefix, external_link, relative_link, soft_link_to_external,
-    virtual, endless_virtual,
-]  # fmt: skip
+    external_storage,
+    relative_storage,
+    storage_with_prefix,
+    external_link,
+    relative_link,
+    soft_link_to_external,
+    virtual,
+    endless_virtual,
+]
 Way = Callable[[h5py.File, str, tuple[int, ...], Path], None]
 ROLES: dict[str, tuple[int, ...]] = {
-    "cube": SHAPE, "L1/reflectance": SHAPE, "wavelengths": (11,), "scan/wavelength_nm": (11,), "bbl": (11,),
-    "anything/else": (4,), "scale_factor": (1,), "nodata": (1,),
-}  # fmt: skip
+    "cube": SHAPE,
+    "L1/reflectance": SHAPE,
+    "wavelengths": (11,),
+    "scan/wavelength_nm": (11,),
+    "bbl": (11,),
+    "anything/else": (4,),
+    "scale_factor": (1,),
+    "nodata": (1,),
+}
 
 
 @pytest.mark.parametrize("way", WAYS)

@@ -243,10 +243,15 @@ def test_matlab5_struct(tmp_path: Path, packed: bool, order: str) -> None:
     content = {
         "note": "x" * 3000,
         "scan": {
-            "empty": np.zeros((0, 0)), "words": "text", "wavelengths": NM, "unit": 1j, "units": "nm",
-            "deep": {"er": {"Img": COUNTS.copy(order="F" if order == "F" else "C")}}, "small": np.uint8(3),
+            "empty": np.zeros((0, 0)),
+            "words": "text",
+            "wavelengths": NM,
+            "unit": 1j,
+            "units": "nm",
+            "deep": {"er": {"Img": COUNTS.copy(order="F" if order == "F" else "C")}},
+            "small": np.uint8(3),
         },
-    }  # fmt: skip
+    }
     scipy_io.savemat(tmp_path / "x.mat", content, do_compression=packed)
     cube = open_cube(tmp_path / "x.mat")
     check_reads(cube, COUNTS)

@@ -76,10 +76,17 @@ def test_envi_defaults_and_comments(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("header", "data"),
     [
-        ("x.hdr", "x"), ("x.hdr", "x.raw"), ("x.hdr", "x.img"), ("x.hdr", "x.dat"), ("x.hdr", "x.bsq"),
-        ("x.bsq.hdr", "x.bsq"), ("X.HDR", "x.RAW"), ("x.hdr", "X.IMG"), ("a.b.hdr", "a.b.raw"),
+        ("x.hdr", "x"),
+        ("x.hdr", "x.raw"),
+        ("x.hdr", "x.img"),
+        ("x.hdr", "x.dat"),
+        ("x.hdr", "x.bsq"),
+        ("x.bsq.hdr", "x.bsq"),
+        ("X.HDR", "x.RAW"),
+        ("x.hdr", "X.IMG"),
+        ("a.b.hdr", "a.b.raw"),
     ],
-)  # fmt: skip
+)
 def test_envi_names(tmp_path: Path, header: str, data: str) -> None:
     values = random_values("u2")
     made = write_envi(tmp_path / "made.hdr", values)
@@ -102,15 +109,31 @@ def test_envi_prefers_data_that_are_long_enough(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("samples", 0), ("lines", -4), ("bands", "many"), ("samples", "9" * 400), ("lines", 10**12),
-        ("bands", ""), ("lines", "7.5"), ("bands", 2**31 - 1), ("data type", 6), ("data type", 9),
+        ("samples", 0),
+        ("lines", -4),
+        ("bands", "many"),
+        ("samples", "9" * 400),
+        ("lines", 10**12),
+        ("bands", ""),
+        ("lines", "7.5"),
+        ("bands", 2**31 - 1),
+        ("data type", 6),
+        ("data type", 9),
         ("data type", 7),
-        ("data type", "float"), ("interleave", "bup"), ("interleave", ""), ("byte order", 2),
-        ("header offset", -1), ("file compression", 3), ("file type", "ENVI Classification"),
-        ("file type", "ENVI Spectral Library"), ("wavelength", "{400, red}"), ("bbl", "{1, x}"),
-        ("reflectance scale factor", 0), ("reflectance scale factor", "nan"),
+        ("data type", "float"),
+        ("interleave", "bup"),
+        ("interleave", ""),
+        ("byte order", 2),
+        ("header offset", -1),
+        ("file compression", 3),
+        ("file type", "ENVI Classification"),
+        ("file type", "ENVI Spectral Library"),
+        ("wavelength", "{400, red}"),
+        ("bbl", "{1, x}"),
+        ("reflectance scale factor", 0),
+        ("reflectance scale factor", "nan"),
     ],
-)  # fmt: skip
+)
 def test_envi_refusals_name_the_field(tmp_path: Path, field: str, value: object) -> None:
     path = write_envi(tmp_path / "x.hdr", random_values("u2"), drop=(field,))
     path.write_text(f"{path.read_text()}{field} = {value}\n")

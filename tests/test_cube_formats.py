@@ -198,9 +198,13 @@ def test_tiff(tmp_path: Path, dtype: str, layout: str, order: str) -> None:
     else:
         packing = "zlib" if layout == "packed" else None
         tifffile.imwrite(
-            path, pages, photometric="minisblack", compression=packing, byteorder=order,
+            path,
+            pages,
+            photometric="minisblack",
+            compression=packing,
+            byteorder=order,
             metadata={"wavelengths": NM.tolist()},
-        )  # fmt: skip
+        )
     cube = open_cube(path)
     check_reads(cube, values)
     if layout in ("pages", "packed"):

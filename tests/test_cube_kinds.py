@@ -104,9 +104,14 @@ def test_a_marker_left_out_of_a_scan_is_placed_by_the_others(axis: Axis) -> None
 
 @settings(max_examples=40, deadline=None)
 @given(
-    st.floats(0.1, 8.0), st.floats(-0.6, 0.6), st.floats(-0.6, 0.6), st.floats(0.0, 6.3), st.booleans(),
-    st.sampled_from([(0, 1, 2, 3), (0, 1, 2), (0, 1), (3,)]), st.sampled_from([0.0, 0.02, 3.0]),
-)  # fmt: skip
+    st.floats(0.1, 8.0),
+    st.floats(-0.6, 0.6),
+    st.floats(-0.6, 0.6),
+    st.floats(0.0, 6.3),
+    st.booleans(),
+    st.sampled_from([(0, 1, 2, 3), (0, 1, 2), (0, 1), (3,)]),
+    st.sampled_from([0.0, 0.02, 3.0]),
+)
 def test_whatever_the_corners_show_ends_in_a_camera_or_a_refusal(
     aspect: float, x: float, y: float, turn: float, mirrored: bool, ids: tuple[int, ...], noise_px: float
 ) -> None:
@@ -170,11 +175,13 @@ CUBES = {
     "scan of rows": Cube({"cube_scan": "rows"}, "scan_rows", 1.0, frozenset({NOT_FRAME})),
     "scan of columns": Cube({"cube_scan": "columns"}, "scan_columns", 1.0, frozenset({NOT_FRAME})),
     "slow scan": Cube(
-        {"cube_scan": "rows", "cube_aspect": 1.03, "cube_rows": 249}, "scan_rows", 1.03,
+        {"cube_scan": "rows", "cube_aspect": 1.03, "cube_rows": 249},
+        "scan_rows",
+        1.03,
         frozenset({NOT_FRAME, NOT_SQUARE}),
     ),
     "scan aslant": Cube({"cube_scan": "rows", "scan_pitch_deg": 10.0}, "scan_rows", 1.0, frozenset({NOT_FRAME})),
-}  # fmt: skip
+}
 
 
 def run_on(
@@ -243,5 +250,3 @@ def test_corners_of_a_cube_are_those_of_its_camera(finished: Finished, small: On
     residuals = np.array(report.cube_corners.residuals_px)
     assert 0.0 < np.sqrt((residuals**2).mean()) < 0.1
     assert 0.0 < report.cube_camera.reprojection_rms_px < 0.15
-
-

@@ -34,11 +34,18 @@ NOBODY = 65534
 @pytest.mark.parametrize(
     ("header", "data"),
     [
-        ("x.hdr", "x.hyspex"), ("x.hdr", "x.HYSPEX"), ("X.HDR", "x.Raw"), ("x.raw.hdr", "x.raw"), ("x.HDR", "x.cube"),
-        ("x.hdr", "x.anything"), ("x.v2.hdr", "x.v2.hyspex"), ("x.hyspex.hdr", "x.hyspex"), ("x.hdr", "x.float32"),
+        ("x.hdr", "x.hyspex"),
+        ("x.hdr", "x.HYSPEX"),
+        ("X.HDR", "x.Raw"),
+        ("x.raw.hdr", "x.raw"),
+        ("x.HDR", "x.cube"),
+        ("x.hdr", "x.anything"),
+        ("x.v2.hdr", "x.v2.hyspex"),
+        ("x.hyspex.hdr", "x.hyspex"),
+        ("x.hdr", "x.float32"),
         ("x y (1).hdr", "x y (1).LAN"),
     ],
-)  # fmt: skip
+)
 def test_whatever_the_header_stands_beside(tmp_path: Path, header: str, data: str) -> None:
     made = write_envi(tmp_path / "made.hdr", VALUES)
     made.with_suffix(".raw").rename(tmp_path / data)
@@ -90,10 +97,14 @@ def test_data_that_a_link_leads_to(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("start", "encoding"),
     [
-        (b"\xff\xfe", "utf-16-le"), (b"\xfe\xff", "utf-16-be"), (b"", "utf-16-le"), (b"", "utf-16-be"),
-        (b"\xef\xbb\xbf", "utf-8"), (b"", "latin-1"),
+        (b"\xff\xfe", "utf-16-le"),
+        (b"\xfe\xff", "utf-16-be"),
+        (b"", "utf-16-le"),
+        (b"", "utf-16-be"),
+        (b"\xef\xbb\xbf", "utf-8"),
+        (b"", "latin-1"),
     ],
-)  # fmt: skip
+)
 @pytest.mark.parametrize("newline", ["\n", "\r\n", "\r"])
 def test_encodings_of_the_header(tmp_path: Path, start: bytes, encoding: str, newline: str) -> None:
     path = write_envi(tmp_path / "x.hdr", VALUES, wavelength="{" + ",".join(map(str, range(400, 411))) + "}")

@@ -105,9 +105,13 @@ def test_reflectance_gains_come_before_those_of_radiance(tmp_path: Path) -> None
     stored = np.rint(scene() * 1e4).astype("u2")
     gains, offsets = np.linspace(0.5e-4, 2e-4, 6), np.linspace(-0.05, 0.05, 6)
     path = write_envi(
-        tmp_path / "x.hdr", stored, description="{Radiance}", data_gain_values=listed(gains * 300),
-        data_reflectance_gain_values=listed(gains), data_reflectance_offset_values=listed(offsets),
-    )  # fmt: skip
+        tmp_path / "x.hdr",
+        stored,
+        description="{Radiance}",
+        data_gain_values=listed(gains * 300),
+        data_reflectance_gain_values=listed(gains),
+        data_reflectance_offset_values=listed(offsets),
+    )
     cube = open_cube(path)
     assert (cube.quantity, cube.to_reflectance) == ("reflectance", 1.0)
     np.testing.assert_allclose(cube.read_rows(0, 24), stored * gains + offsets, rtol=1e-5, atol=1e-6)

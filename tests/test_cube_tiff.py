@@ -37,9 +37,15 @@ def test_compressions(tmp_path: Path, compression: str, predictor: bool, dtype: 
             options["planarconfig"] = layout
         path = tmp_path / f"{layout}.tif"
         tifffile.imwrite(
-            path, stored, photometric="minisblack", compression=compression, predictor=predictor,
-            byteorder=order, metadata=None, **options,
-        )  # fmt: skip
+            path,
+            stored,
+            photometric="minisblack",
+            compression=compression,
+            predictor=predictor,
+            byteorder=order,
+            metadata=None,
+            **options,
+        )
         with tifffile.TiffFile(path) as file:
             page = file.pages.first
             assert (page.compression > 1, page.predictor > 1) == (True, predictor)
@@ -73,9 +79,9 @@ def test_jpeg_is_read_and_said(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("code", "name"), [(34712, "JPEG2000"), (50001, "WEBP"), (34887, "LERC"), (50002, "JPEGXL"), (12345, "12345"),
-                       (2, "CCITTRLE")],
-)  # fmt: skip
+    ("code", "name"),
+    [(34712, "JPEG2000"), (50001, "WEBP"), (34887, "LERC"), (50002, "JPEGXL"), (12345, "12345"), (2, "CCITTRLE")],
+)
 def test_a_compression_that_is_not_read_is_named(tmp_path: Path, code: int, name: str) -> None:
     path = tmp_path / "x.tif"
     pages = np.ascontiguousarray(smooth("u1").transpose(2, 0, 1))

@@ -293,10 +293,13 @@ def test_negative_reflectance_is_kept(tmp_path: Path, low: float, dtype: str) ->
 @pytest.mark.parametrize(
     ("factor", "offset", "said"),
     [
-        (1e-2, 0, "more than"), (30, 0, "percent"), (900, 0, "scale seems wrong"), (-1, 0, "negative"),
+        (1e-2, 0, "more than"),
+        (30, 0, "percent"),
+        (900, 0, "scale seems wrong"),
+        (-1, 0, "negative"),
         (1, -0.7, "below"),
     ],
-)  # fmt: skip
+)
 def test_implausible_reflectance_is_said(tmp_path: Path, factor: float, offset: float, said: str) -> None:
     values = ((truth() * factor + offset) * 1e4).astype("f4")
     cube = open_cube(write_envi(tmp_path / "x.hdr", values.astype("i4"), reflectance_scale_factor=10000))
@@ -342,8 +345,9 @@ def test_saturation_is_that_of_the_raw_counts(tmp_path: Path) -> None:
     dark = np.full((1, 50, 8), 80, "u2")
     cube = open_cube(
         write_envi(tmp_path / "x.hdr", stored),
-        white=write_envi(tmp_path / "w.hdr", white), dark=write_envi(tmp_path / "d.hdr", dark),
-    )  # fmt: skip
+        white=write_envi(tmp_path / "w.hdr", white),
+        dark=write_envi(tmp_path / "d.hdr", dark),
+    )
     assert "saturated" in codes(cube)
     image, flags, _ = as_image(cube, tmp_path)
     assert (flagged(flags, Flag.SATURATED) == right).all()
@@ -354,9 +358,11 @@ def test_saturation_is_that_of_the_raw_counts(tmp_path: Path) -> None:
 def test_saturation_survives_gains(tmp_path: Path) -> None:
     stored, right = counts(12)
     path = write_envi(
-        tmp_path / "x.hdr", stored,
-        data_gain_values=listed(np.linspace(0.01, 0.03, 8)), data_offset_values=listed(np.linspace(-1, 1, 8)),
-    )  # fmt: skip
+        tmp_path / "x.hdr",
+        stored,
+        data_gain_values=listed(np.linspace(0.01, 0.03, 8)),
+        data_offset_values=listed(np.linspace(-1, 1, 8)),
+    )
     _, flags, _ = as_image(open_cube(path), tmp_path)
     assert (flagged(flags, Flag.SATURATED) == right).all()
 

@@ -30,15 +30,24 @@ BANDS = np.arange(1.0, 17)
     [
         ("nm|Nanometers|NANOMETRES|nano-meter|nano meters|Wavelength (nm)|Wavelength [nm]|wavelength in nm|nm.", NM),
         ("um|µm|μm|Micrometers|micrometre|Microns|micro-meters|Wavelength (um)", NM / 1e3),
-        ("mm|Millimeters", NM / 1e6), ("cm|Centimeters|centimetre", NM / 1e7), ("m|Meters|metre", NM / 1e9),
-        ("pm|picometers", NM * 1e3), ("Angstroms|Å|Ångström|A|angstrom", NM * 10), ("inch|Inches", NM / 25.4e6),
+        ("mm|Millimeters", NM / 1e6),
+        ("cm|Centimeters|centimetre", NM / 1e7),
+        ("m|Meters|metre", NM / 1e9),
+        ("pm|picometers", NM * 1e3),
+        ("Angstroms|Å|Ångström|A|angstrom", NM * 10),
+        ("inch|Inches", NM / 25.4e6),
         ("cm-1|cm^-1|1/cm|cm⁻¹|cm**-1|Wavenumber|Wavenumbers (cm-1)|per cm|inverse centimeters|kayser", 1e7 / NM),
-        ("m-1|1/m|m^-1", 1e9 / NM), ("Hz|hertz", 299792458e9 / NM), ("kHz", 299792458e6 / NM),
-        ("MHz|mhz|Megahertz", 299792458e3 / NM), ("GHz|gigahertz|Frequency (GHz)", 299792458 / NM),
-        ("THz|terahertz", 299792.458 / NM), ("eV|electron volts|Energy (eV)", 1239.841984 / NM),
-        ("meV", 1239841.984 / NM), ("keV", 1.239841984 / NM),
+        ("m-1|1/m|m^-1", 1e9 / NM),
+        ("Hz|hertz", 299792458e9 / NM),
+        ("kHz", 299792458e6 / NM),
+        ("MHz|mhz|Megahertz", 299792458e3 / NM),
+        ("GHz|gigahertz|Frequency (GHz)", 299792458 / NM),
+        ("THz|terahertz", 299792.458 / NM),
+        ("eV|electron volts|Energy (eV)", 1239.841984 / NM),
+        ("meV", 1239841.984 / NM),
+        ("keV", 1.239841984 / NM),
     ],
-)  # fmt: skip
+)
 def test_units(words: str, in_unit: np.typing.NDArray[np.float64]) -> None:
     for word in words.split("|"):
         nm, warnings = nanometres(in_unit, word, 16)
@@ -77,7 +86,7 @@ def test_units(words: str, in_unit: np.typing.NDArray[np.float64]) -> None:
         (NM[[0, 1, 2, 4, 3, *range(5, 16)]], "nm", NM[[0, 1, 2, 4, 3, *range(5, 16)]], "wavelengths_unordered"),
         (NM[:9], "nm", None, "wavelengths_count_mismatch"),
     ],
-)  # fmt: skip
+)
 def test_what_the_numbers_contradict(values: Any, unit: str | None, right: Any, code: str) -> None:
     nm, warnings = nanometres(np.asarray(values, np.float64), unit, 16)
     assert [c for c, _ in warnings] == [code]
@@ -86,9 +95,12 @@ def test_what_the_numbers_contradict(values: Any, unit: str | None, right: Any, 
 
 def test_what_is_no_contradiction() -> None:
     for values, unit in (
-        (np.arange(400.0, 416), None), (np.arange(400.0, 416), "nm"), (np.arange(8.0, 15), "um"),
-        (NM[::-1], "nm"), (np.array([1.0, 2.0]), "um"),
-    ):  # fmt: skip
+        (np.arange(400.0, 416), None),
+        (np.arange(400.0, 416), "nm"),
+        (np.arange(8.0, 15), "um"),
+        (NM[::-1], "nm"),
+        (np.array([1.0, 2.0]), "um"),
+    ):
         nm, warnings = nanometres(values, unit, values.size)
         np.testing.assert_allclose(nm, values * (1e3 if unit == "um" else 1))
         assert warnings == ()
@@ -194,9 +206,13 @@ def _gdal_tiff(folder: Path, values: Any, wavelengths: Any, unit: str) -> Path:
     items += [f'<Item name="wavelength_units" sample="{i}">{unit}</Item>' for i in range(len(wavelengths))]
     xml = f"<GDALMetadata>{''.join(items)}</GDALMetadata>"
     tifffile.imwrite(
-        folder / "x.tif", np.ascontiguousarray(values.transpose(2, 0, 1)), photometric="minisblack",
-        planarconfig="separate", metadata=None, extratags=[(42112, "s", 0, xml, True)],
-    )  # fmt: skip
+        folder / "x.tif",
+        np.ascontiguousarray(values.transpose(2, 0, 1)),
+        photometric="minisblack",
+        planarconfig="separate",
+        metadata=None,
+        extratags=[(42112, "s", 0, xml, True)],
+    )
     return folder / "x.tif"
 
 
@@ -208,8 +224,18 @@ def _described_tiff(folder: Path, values: Any, wavelengths: Any, unit: str) -> P
 
 
 CONTAINERS = [
-    _envi, _hdf5, _hdf5_attribute, _hdf5_text, _matlab73, _matlab5, _npz, _netcdf3, _tiff, _gdal_tiff, _described_tiff,
-]  # fmt: skip
+    _envi,
+    _hdf5,
+    _hdf5_attribute,
+    _hdf5_text,
+    _matlab73,
+    _matlab5,
+    _npz,
+    _netcdf3,
+    _tiff,
+    _gdal_tiff,
+    _described_tiff,
+]
 
 
 @pytest.mark.parametrize("write", CONTAINERS)

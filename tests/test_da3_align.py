@@ -32,9 +32,7 @@ class Exact:
         rays = self.views[0].intrinsics.rays(np.stack([cols, rows], -1).astype(float))
         places = self.views[0].cam_from_world.inverse().apply(rays * self.depth[0][rows, cols, None])
         markers = np.arange(len(self.truth.marker_ids))
-        seen = Observations(
-            np.zeros(len(markers), int), markers, np.zeros((len(markers), 4, 2)), np.ones(len(markers))
-        )
+        seen = Observations(np.zeros(len(markers), int), markers, np.zeros((len(markers), 4, 2)), np.ones(len(markers)))
         self.known = np.concatenate([on_markers(self.truth.marker_corners, seen, 0), places])
 
 

@@ -115,9 +115,11 @@ def test_true_depth_in_any_unit_makes_a_true_cloud(
     settings = replace(settings, reconstruct=replace(settings.reconstruct, backend="da3"))
     heard: list[tuple[str, float]] = []
     report = run_pipeline(
-        Inputs(small.photos, small.header), tmp_path / "out", settings,
+        Inputs(small.photos, small.header),
+        tmp_path / "out",
+        settings,
         progress=lambda stage, share: heard.append((stage, share)),
-    )  # fmt: skip
+    )
     found = judge(tmp_path / "out", small.folder)
     # Eleven views, each off by 1 % or 1.5 mm; drawing them to known places takes most of it off, meeting five others
     # halves the rest, and refining the mesh leaves about what it leaves of any depth.
@@ -137,8 +139,11 @@ def test_true_depth_in_any_unit_makes_a_true_cloud(
 
 
 def test_depth_that_fits_no_marker_is_no_depth(captured: Captured, weights: Path, tmp_path: Path) -> None:
-    script = write_script(tmp_path, f"""rng = np.random.default_rng(0)
-return {{"depth": rng.uniform(0.5, 1.5, arrays["images"].shape[:3]).astype(np.float32)}}, {FACTS}""")  # fmt: skip
+    script = write_script(
+        tmp_path,
+        f"""rng = np.random.default_rng(0)
+return {{"depth": rng.uniform(0.5, 1.5, arrays["images"].shape[:3]).astype(np.float32)}}, {FACTS}""",
+    )
     with pytest.raises(DepthNotFoundError, match="no photo") as refused:
         reconstruct(captured, Da3Settings(weights=weights, size_px=126), script)
     assert len(refused.value.details["photos"]) == 12  # type: ignore[arg-type]
@@ -217,8 +222,15 @@ def test_a_stop_ends_the_network_at_once(captured: Captured, weights: Path, tmp_
 
 def test_settings_come_from_the_environment(tmp_path: Path) -> None:
     assert settings_from_environment({}) == Da3Settings()
-    given = {"WEIGHTS": str(tmp_path), "HOME": str(tmp_path), "PYTHON": "python3", "DEVICE": "cuda:1",
-             "SIZE_PX": "1008", "BATCH": "30", "WEIGHTS_SHA256": "ab"}  # fmt: skip
+    given = {
+        "WEIGHTS": str(tmp_path),
+        "HOME": str(tmp_path),
+        "PYTHON": "python3",
+        "DEVICE": "cuda:1",
+        "SIZE_PX": "1008",
+        "BATCH": "30",
+        "WEIGHTS_SHA256": "ab",
+    }
     found = settings_from_environment({f"SPECIMAP_DA3_{k}": v for k, v in given.items()})
     assert found == Da3Settings(tmp_path.resolve(), "ab", tmp_path.resolve(), "python3", "cuda:1", 1008, 30)
     for name, value in {"SIZE_PX": "500", "BATCH": "0", "DEVICE": "tpu"}.items():
@@ -240,9 +252,14 @@ def test_the_real_network_loads_and_answers(checkout: Path, random_network: Path
 
     def ask(together: list[list[int]], given: object) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
         answer = run_child(
-            CHILD, {**request, "windows": together}, {"images": images, "K": K, "poses": np.asarray(given)},
-            name="da3", steps={"depth": 1.0}, progress=heard.append, extra_path=[checkout / "src"],
-        )  # fmt: skip
+            CHILD,
+            {**request, "windows": together},
+            {"images": images, "K": K, "poses": np.asarray(given)},
+            name="da3",
+            steps={"depth": 1.0},
+            progress=heard.append,
+            extra_path=[checkout / "src"],
+        )
         assert answer.facts["variant"] == "da3-small"
         assert answer.facts["device"] == "cpu"
         return answer.arrays["depth"]

@@ -70,10 +70,14 @@ CORNERS: dict[str, Callable[[Floats, np.random.Generator], Floats]] = {
 
 @SWEEP
 @given(
-    seed=st.integers(0, 10_000), photos=st.integers(1, 6), markers=st.integers(1, 4),
-    noise_px=st.sampled_from([0.0, 0.1, 5.0, 200.0]), kind=st.sampled_from(sorted(CORNERS)),
-    shown=st.floats(0.2, 1.0), form=st.sampled_from(["rigid", "free"]),
-)  # fmt: skip
+    seed=st.integers(0, 10_000),
+    photos=st.integers(1, 6),
+    markers=st.integers(1, 4),
+    noise_px=st.sampled_from([0.0, 0.1, 5.0, 200.0]),
+    kind=st.sampled_from(sorted(CORNERS)),
+    shown=st.floats(0.2, 1.0),
+    form=st.sampled_from(["rigid", "free"]),
+)
 def test_markers_of_any_kind(
     seed: int, photos: int, markers: int, noise_px: float, kind: str, shown: float, form: Form
 ) -> None:
@@ -84,9 +88,7 @@ def test_markers_of_any_kind(
     seen = replace(seen, corners_px=CORNERS[kind](seen.corners_px, rng)).of(keep)
     with refused_by_name():
         found = solve_from_markers(seen, tuple(range(markers)), (640, 480), edge_mm=6.8)
-        adjusted = adjust(
-            found.scene.lens, found.scene.poses, found.seen, found.markers, AdjustSettings(form=form)
-        )
+        adjusted = adjust(found.scene.lens, found.scene.poses, found.seen, found.markers, AdjustSettings(form=form))
         assert np.isfinite(adjusted.corners).all()
         assert np.isfinite(adjusted.covariance).all()
         assert all(np.isfinite(pose.t).all() for pose in adjusted.poses)
@@ -124,10 +126,15 @@ DEPTHS: dict[str, Callable[[int, float, np.random.Generator], Floats]] = {
 
 @SWEEP
 @given(
-    seed=st.integers(0, 10_000), count=st.integers(1, 5), size=st.sampled_from([16, 64, 128]),
-    distance_mm=st.sampled_from([0.5, 30.0, 150.0, 5000.0]), same=st.booleans(), black=st.booleans(),
-    ring_mm=st.sampled_from([1.0, 20.0, 500.0]), kind=st.sampled_from(sorted(DEPTHS)),
-)  # fmt: skip
+    seed=st.integers(0, 10_000),
+    count=st.integers(1, 5),
+    size=st.sampled_from([16, 64, 128]),
+    distance_mm=st.sampled_from([0.5, 30.0, 150.0, 5000.0]),
+    same=st.booleans(),
+    black=st.booleans(),
+    ring_mm=st.sampled_from([1.0, 20.0, 500.0]),
+    kind=st.sampled_from(sorted(DEPTHS)),
+)
 def test_depth_of_any_kind(
     seed: int, count: int, size: int, distance_mm: float, same: bool, black: bool, ring_mm: float, kind: str
 ) -> None:
@@ -164,16 +171,30 @@ MESHES: dict[str, Callable[[Mesh], Shape]] = {
 
 @SLOW_SWEEP
 @given(
-    seed=st.integers(0, 10_000), count=st.integers(1, 7), kind=st.sampled_from(sorted(MESHES)),
-    distance_mm=st.sampled_from([1.0, 30.0, 150.0, 5000.0]), ring_mm=st.sampled_from([1.0, 15.0, 500.0]),
+    seed=st.integers(0, 10_000),
+    count=st.integers(1, 7),
+    kind=st.sampled_from(sorted(MESHES)),
+    distance_mm=st.sampled_from([1.0, 30.0, 150.0, 5000.0]),
+    ring_mm=st.sampled_from([1.0, 15.0, 500.0]),
     shape=st.tuples(st.sampled_from([1, 8, 40]), st.sampled_from([1, 8, 40]), st.sampled_from([1, 2, 9])),
-    fine_mm=st.sampled_from([0.5, 2.0, 1000.0]), by_camera=st.booleans(), mirrored=st.booleans(),
+    fine_mm=st.sampled_from([0.5, 2.0, 1000.0]),
+    by_camera=st.booleans(),
+    mirrored=st.booleans(),
     values=st.sampled_from(["counts", "holes", "constant"]),
-)  # fmt: skip
+)
 def test_meshes_of_any_kind(
-    tmp_path_factory: pytest.TempPathFactory, seed: int, count: int, kind: str, distance_mm: float, ring_mm: float,
-    shape: tuple[int, int, int], fine_mm: float, by_camera: bool, mirrored: bool, values: str,
-) -> None:  # fmt: skip
+    tmp_path_factory: pytest.TempPathFactory,
+    seed: int,
+    count: int,
+    kind: str,
+    distance_mm: float,
+    ring_mm: float,
+    shape: tuple[int, int, int],
+    fine_mm: float,
+    by_camera: bool,
+    mirrored: bool,
+    values: str,
+) -> None:
     rng, folder, size = np.random.default_rng(seed), tmp_path_factory.mktemp("sweep"), 64
     lens, corners = Intrinsics.centred(size, size, 1.5 * size), layout(ring_mm)
     poses = ring_of_cameras(count, distance_mm, rng, same=False)
@@ -254,12 +275,19 @@ def test_photos_that_cannot_work_are_refused_by_name(tiny: OnDisk, tmp_path: Pat
 @pytest.mark.parametrize(
     "options",
     [
-        ("--r-reg", 1e5), ("--r-reg", 500, "--method", "homography"), ("--r-pc", 50, "--method", "homography"),
-        ("--r-pc", 1e-4), ("--edge-mm", 0.03), ("--edge-mm", 1e-9), ("--edge-mm", 300), ("--edge-mm", "nan"),
-        ("--working-px", 1), ("--working-px", 100_000),
+        ("--r-reg", 1e5),
+        ("--r-reg", 500, "--method", "homography"),
+        ("--r-pc", 50, "--method", "homography"),
+        ("--r-pc", 1e-4),
+        ("--edge-mm", 0.03),
+        ("--edge-mm", 1e-9),
+        ("--edge-mm", 300),
+        ("--edge-mm", "nan"),
+        ("--working-px", 1),
+        ("--working-px", 100_000),
     ],
     ids=str,
-)  # fmt: skip
+)
 def test_settings_that_cannot_work_are_refused_by_name(
     finished: Finished, small: OnDisk, tmp_path: Path, options: tuple[object, ...]
 ) -> None:

@@ -107,9 +107,21 @@ def test_only_the_service_listens_and_its_health_is_asked_for() -> None:
 def test_nothing_is_fetched_by_address_and_no_secret_is_built_in() -> None:
     everything = [step for steps in stages().values() for step in steps]
     assert {word for word, _ in everything} <= {
-        "ARG", "FROM", "ENV", "WORKDIR", "COPY", "RUN", "LABEL", "VOLUME", "STOPSIGNAL", "ENTRYPOINT", "CMD",
-        "HEALTHCHECK", "EXPOSE", "USER",
-    }  # fmt: skip
+        "ARG",
+        "FROM",
+        "ENV",
+        "WORKDIR",
+        "COPY",
+        "RUN",
+        "LABEL",
+        "VOLUME",
+        "STOPSIGNAL",
+        "ENTRYPOINT",
+        "CMD",
+        "HEALTHCHECK",
+        "EXPOSE",
+        "USER",
+    }
     for word, rest in everything:
         assert "://" not in rest or word == "HEALTHCHECK"
         assert not re.search(r"\b(curl|wget|git)\b", rest)
@@ -157,8 +169,10 @@ def test_hadolint_finds_nothing() -> None:
         pytest.skip("there is no hadolint; it comes with the extra dev")
     done = subprocess.run(
         [hadolint, "--failure-threshold", "style", str(DOCKER / "Dockerfile")],
-        capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
     assert (done.returncode, done.stdout) == (0, "")
 
 
@@ -212,8 +226,11 @@ def test_compose_itself_takes_the_file(name: str, profiles: str) -> None:
         pytest.skip("there is no docker compose")
     done = subprocess.run(
         [*command, "--file", str(DOCKER / name), "config", "--quiet"],
-        env={**os.environ, **GIVEN, "COMPOSE_PROFILES": profiles}, capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
+        env={**os.environ, **GIVEN, "COMPOSE_PROFILES": profiles},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
     assert done.returncode == 0, done.stderr
 
 

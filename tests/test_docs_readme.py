@@ -45,10 +45,16 @@ def working(service: Running, result: Result) -> Iterator[None]:
             assert found is not None
             session.add(
                 CloudRow(
-                    id=new_id("cloud"), job_id=job_id, acquisition_id=job.acquisition_id, prefix=found.prefix,
-                    points=found.points, bands=found.bands, size=found.size, report=found.report,
+                    id=new_id("cloud"),
+                    job_id=job_id,
+                    acquisition_id=job.acquisition_id,
+                    prefix=found.prefix,
+                    points=found.points,
+                    bands=found.bands,
+                    size=found.size,
+                    report=found.report,
                 )
-            )  # fmt: skip
+            )
             session.flush()
             jobs.finish(session, job_id, EXECUTOR, "succeeded")
 
@@ -72,9 +78,11 @@ def test_program_of_the_readme(
         shutil.copy(SAMPLES / "hsi" / f"hsi.{end}", tmp_path / f"scan.{end}")
     monkeypatch.chdir(tmp_path)
     environment = {
-        "SPECIMAP_URL": service.url, "SPECIMAP_KEY": service.key(["upload", "read"]), "NO_PROXY": "127.0.0.1",
+        "SPECIMAP_URL": service.url,
+        "SPECIMAP_KEY": service.key(["upload", "read"]),
+        "NO_PROXY": "127.0.0.1",
         "no_proxy": "127.0.0.1",
-    }  # fmt: skip
+    }
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
     # Its place is the specimen's; the points of this cloud lie elsewhere.

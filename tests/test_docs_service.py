@@ -86,8 +86,9 @@ def uploads(reader: Reader) -> None:
     resumed = reader.sh("Resumable")
     photo = reader.folder / "IMG_0003.jpg"
     assert re.findall(r"^upload-offset: (\d+)", resumed, re.MULTILINE | re.IGNORECASE) == [
-        str(SPLIT), str(photo.stat().st_size),
-    ]  # fmt: skip
+        str(SPLIT),
+        str(photo.stat().st_size),
+    ]
     assert header(resumed, "specimap-verdict") == "accepted"
     (result,) = documents(reader.sh("Resumable"))
     assert (result["state"], result["file"]["id"]) == ("finished", header(resumed, "specimap-file"))
@@ -115,8 +116,10 @@ def jobs_and_events(reader: Reader) -> None:
     reader.variables["JOB"] = made["id"]
     (again,) = documents(reader.sh("Jobs"))
     assert (again["rerun_of"], again["settings"]["method"], again["settings"]["r_pc"]) == (
-        made["id"], "homography", 0.5,
-    )  # fmt: skip
+        made["id"],
+        "homography",
+        0.5,
+    )
     listed, cancelled, log = documents(reader.sh("Jobs"))
     assert [job["id"] for job in listed["items"]] == [again["id"], made["id"]]
     assert cancelled["state"] == "cancelled"
@@ -213,8 +216,13 @@ def spectra(reader: Reader, cloud: Cloud) -> None:
     triangle = cloud.in_polygon([(10, 10), (10, 30), (40, 20)])
     near = cloud.in_radius(centre, 1.5)
     expected: list[Any] = [
-        [17, 4, 5], pixels, triangle, cloud.nearest(centre, 8)[0], cloud.in_box((0, -4, -5), (4, 0, 5)), near,
-    ]  # fmt: skip
+        [17, 4, 5],
+        pixels,
+        triangle,
+        cloud.nearest(centre, 8)[0],
+        cloud.in_box((0, -4, -5), (4, 0, 5)),
+        near,
+    ]
     assert selections == [list(indices) for indices in expected]
     (page,) = documents(reader.sh("Spectra"))
     assert (page["total"], page["bands"]) == (len(near), [1, 2, 3])

@@ -69,15 +69,18 @@ def test_every_picture_decodes_and_is_described(page: Page) -> None:
         assert len(image["alt"]) > 20
     assert set(kinds) == {"image/svg+xml", "image/png", "image/jpeg"}
     assert len(page.images) == 10
-    assert page.text.startswith("<!DOCTYPE html>\n<html lang=\"en\">")
+    assert page.text.startswith('<!DOCTYPE html>\n<html lang="en">')
     assert [text for tag, text in page.headings if tag == "h1"] == ["Accuracy report"]
 
 
 def test_figures_are_those_of_the_report(folder: Path, page: Page) -> None:
     report = Report.model_validate_json((folder / "report.json").read_text(encoding="utf-8"))
     two = report.corner_2d_mm
-    assert page.row("2D corner error") == ["2D corner error, mean ± sd", *2 * [f"{two.mean:.3f} ± {two.std:.3f}"],
-                                           "0.013-0.017"]  # fmt: skip
+    assert page.row("2D corner error") == [
+        "2D corner error, mean ± sd",
+        *2 * [f"{two.mean:.3f} ± {two.std:.3f}"],
+        "0.013-0.017",
+    ]
     assert page.row("3D corner error")[1] == "0.100 (0.050, 0.150)"
     assert page.row("Leaving a marker out, median")[1:] == ["0.021 (0.043)", "0.021 (0.043)", "–"]
     assert page.row("Stated sigma of")[1] == "0.100 (0.300)"
@@ -210,10 +213,13 @@ def test_hardly_any_points(tmp_path: Path, count: int) -> None:
 
 def test_a_photo_without_markers(tmp_path: Path) -> None:
     report = full_report(10)
-    bare = [photo.model_copy(update={"marker_ids": [], "corners_px": [], "residuals_px": []})
-            for photo in report.photo_corners or ()]  # fmt: skip
-    some = folder_of(tmp_path / "some", report.model_copy(update={"photo_corners": [*(report.photo_corners or ()),
-                                                                                    *bare[:1]]}))  # fmt: skip
+    bare = [
+        photo.model_copy(update={"marker_ids": [], "corners_px": [], "residuals_px": []})
+        for photo in report.photo_corners or ()
+    ]
+    some = folder_of(
+        tmp_path / "some", report.model_copy(update={"photo_corners": [*(report.photo_corners or ()), *bare[:1]]})
+    )
     assert page_of(some).row("4")[3:] == ["none", "–"]
     none = folder_of(tmp_path / "none", report.model_copy(update={"photo_corners": bare}))
     assert len(page_of(none).images) == 10

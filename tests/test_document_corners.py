@@ -29,9 +29,14 @@ def stage_one() -> tuple[Stage1, NDArray[np.bool_]]:
     shown = seen.of((seen.marker != LONELY) | (seen.photo == 4))
     photos = tuple(p for p in range(7) if p != REFUSED)
     reconstruction = Reconstruction(
-        photos, scene.lens, tuple(scene.poses[p] for p in photos), (), np.zeros((0, 3), np.float32),
-        (Refusal("p2.jpg", "photo_blurred", "Blurred."),), (),
-    )  # fmt: skip
+        photos,
+        scene.lens,
+        tuple(scene.poses[p] for p in photos),
+        (),
+        np.zeros((0, 3), np.float32),
+        (Refusal("p2.jpg", "photo_blurred", "Blurred."),),
+        (),
+    )
     names = tuple(f"p{p}.jpg" for p in range(7))
     kept = (shown.photo != REFUSED) & (shown.marker != LONELY)
     return Stage1(reconstruction, CornersInPhotos(shown, IDS), names, (), None, ()), kept

@@ -50,14 +50,20 @@ def test_nothing_needs_a_screen_or_says_anything() -> None:
         "print('matplotlib.pyplot' in sys.modules)"
     )
     told = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True, timeout=120,
+        [sys.executable, "-W", "error", "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
         env={"MPLCONFIGDIR": "/proc/nowhere", "HOME": "/proc/nowhere"},
-    )  # fmt: skip
+    )
     assert (told.stdout, told.stderr) == ("False\n", "")
 
 
-@pytest.mark.parametrize(("px_per_mm", "width_px", "length"), [(10, 640, 10), (1, 64, 10), (100, 640, 1),
-                                                              (3, 1000, 50), (float("nan"), 100, 0)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("px_per_mm", "width_px", "length"),
+    [(10, 640, 10), (1, 64, 10), (100, 640, 1), (3, 1000, 50), (float("nan"), 100, 0)],
+)
 def test_a_scale_bar_is_as_long_as_it_says(px_per_mm: float, width_px: float, length: float) -> None:
     ax = plotting.figure().add_subplot()
     assert plotting.scale_bar(ax, px_per_mm, width_px) == length

@@ -55,8 +55,10 @@ def test_verdicts() -> None:
     assert all(check.good for check in checks(board))
 
 
-@pytest.mark.parametrize(("median", "said"), [(0.123, "about 0.1 mm"), (0.087, "about 0.09 mm"), (2.4, "about 2 mm"),
-                                              (float("nan"), "not known")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("median", "said"),
+    [(0.123, "about 0.1 mm"), (0.087, "about 0.09 mm"), (2.4, "about 2 mm"), (float("nan"), "not known")],
+)
 def test_how_places_are_put_in_words(median: float, said: str) -> None:
     report = full_report(10).model_copy(update={"sigma_mm": SigmaFigures(median=median, p95=2 * median)})
     assert said in placed(report)

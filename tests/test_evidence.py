@@ -38,9 +38,7 @@ def folder_with(folder: Path, *files: str) -> Path:
         (("rgb/a.jpg", "cube.npy"), "cube.npy", False),
     ],
 )
-def test_an_acquisition_is_found_in_its_folder(
-    tmp_path: Path, files: tuple[str, ...], cube: str, truth: bool
-) -> None:
+def test_an_acquisition_is_found_in_its_folder(tmp_path: Path, files: tuple[str, ...], cube: str, truth: bool) -> None:
     found = find_capture(folder_with(tmp_path / "SP 1", *files))
     assert found.cube == tmp_path / "SP 1" / cube
     assert [p.name for p in found.photos] == [Path(files[0]).name]
@@ -127,9 +125,7 @@ def test_text_goes_between_the_marks(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text("before\n<!-- v -->\nold\nold\n<!-- /v -->\nafter <!-- w -->\n<!-- /w -->\n", "utf-8")
     put(page, "v", r"new \1 {x}")
-    assert page.read_text("utf-8") == (
-        "before\n<!-- v -->\nnew \\1 {x}\n<!-- /v -->\nafter <!-- w -->\n<!-- /w -->\n"
-    )
+    assert page.read_text("utf-8") == ("before\n<!-- v -->\nnew \\1 {x}\n<!-- /v -->\nafter <!-- w -->\n<!-- /w -->\n")
     put(page, "w", "more")
     assert "<!-- w -->\nmore\n<!-- /w -->" in check_marks(page, "w")
     for text in ("no mark", "<!-- v -->\n<!-- /v -->\n<!-- v -->\n<!-- /v -->\n"):

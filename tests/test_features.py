@@ -58,8 +58,10 @@ def test_matching_nothing_gives_nothing(photos: list[Photo]) -> None:
 
 def test_triangulation_is_exact_and_refuses_what_does_not_meet() -> None:
     lens = Intrinsics.centred(640, 480, 800.0, 0.05)
-    views = [View(lens, look_at(np.array(eye), np.zeros(3), np.array([0.0, 0, 1])))
-             for eye in ([80.0, 0, 120], [60.0, 50, 120])]  # fmt: skip
+    views = [
+        View(lens, look_at(np.array(eye), np.zeros(3), np.array([0.0, 0, 1])))
+        for eye in ([80.0, 0, 120], [60.0, 50, 120])
+    ]
     points = np.random.default_rng(0).uniform(-10, 10, (30, 3))
     xy = tuple(v.project(points) for v in views)
     found, good = triangulate_pair(lens, (views[0].cam_from_world, views[1].cam_from_world), (xy[0], xy[1]))

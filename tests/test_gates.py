@@ -27,9 +27,13 @@ from specimap.core.report import PhotoCorners, Report
 def photo(name: str, off: float, *, width: int = 640) -> PhotoCorners:
     """Two markers, all corners ``off`` px off to the right."""
     return PhotoCorners(
-        name=name, width_px=width, height_px=480, marker_ids=[0, 7], corners_px=[square(30, 30), square(200, 150)],
+        name=name,
+        width_px=width,
+        height_px=480,
+        marker_ids=[0, 7],
+        corners_px=[square(30, 30), square(200, 150)],
         residuals_px=[[off, 0.0] * 4, [off, 0.0] * 4],
-    )  # fmt: skip
+    )
 
 
 def report(**changes: Any) -> Report:

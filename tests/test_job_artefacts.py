@@ -37,10 +37,16 @@ def running(tables: Database, acquisition: str) -> str:
     with tables.session() as session:
         session.add(
             Job(
-                id=job_id, acquisition_id=acquisition, settings={}, priority=5, state="queued", request_hash="",
-                correlation_id="test", created_by="key_test",
+                id=job_id,
+                acquisition_id=acquisition,
+                settings={},
+                priority=5,
+                state="queued",
+                request_hash="",
+                correlation_id="test",
+                created_by="key_test",
             )
-        )  # fmt: skip
+        )
     with tables.session() as session:
         assert jobs.claim(session, job_id, f"here:{job_id}") is not None
     return job_id

@@ -22,9 +22,10 @@ from specimap.core.report import Report, Spread, read_report
 ROOT = Path(__file__).parents[1]
 ELSEWHERE = {
     # These run in an interpreter of the network's own, without Specimap; who reads them writes strictly.
-    "specimap/core/reconstruct/learned/child.py", "specimap/core/reconstruct/learned/probing.py",
+    "specimap/core/reconstruct/learned/child.py",
+    "specimap/core/reconstruct/learned/probing.py",
     "specimap/core/jsontext.py",
-}  # fmt: skip
+}
 
 
 def strictly(text: str) -> Any:
@@ -42,11 +43,21 @@ def strictly(text: str) -> Any:
 def encoders(source: str) -> list[ast.Call]:
     """Calls of the standard encoder that let NaN through."""
     calls = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call)]
-    named = [c for c in calls if isinstance(c.func, ast.Attribute) and c.func.attr in ("dumps", "dump")
-             and isinstance(c.func.value, ast.Name) and c.func.value.id == "json"]  # fmt: skip
-    return [c for c in named if not any(
-        k.arg == "allow_nan" and isinstance(k.value, ast.Constant) and k.value.value is False for k in c.keywords
-    )]  # fmt: skip
+    named = [
+        c
+        for c in calls
+        if isinstance(c.func, ast.Attribute)
+        and c.func.attr in ("dumps", "dump")
+        and isinstance(c.func.value, ast.Name)
+        and c.func.value.id == "json"
+    ]
+    return [
+        c
+        for c in named
+        if not any(
+            k.arg == "allow_nan" and isinstance(k.value, ast.Constant) and k.value.value is False for k in c.keywords
+        )
+    ]
 
 
 def test_nothing_writes_json_but_by_the_strict_encoder() -> None:
@@ -91,13 +102,25 @@ def test_every_tree_is_written_and_read_back(value: Any) -> None:
 
 def test_numbers_of_numpy_paths_and_sets() -> None:
     given_ = {
-        "f4": np.float32(0.5), "nan": np.float32("nan"), "i": np.int64(3), "b": np.bool_(True), 7: Path("/a/b"),
-        "array": np.array([[1.0, np.inf], [np.nan, -2.0]]), "set": {1}, "double": np.float64("-inf"),
-    }  # fmt: skip
+        "f4": np.float32(0.5),
+        "nan": np.float32("nan"),
+        "i": np.int64(3),
+        "b": np.bool_(True),
+        7: Path("/a/b"),
+        "array": np.array([[1.0, np.inf], [np.nan, -2.0]]),
+        "set": {1},
+        "double": np.float64("-inf"),
+    }
     assert strictly(json_text(given_)) == {
-        "f4": 0.5, "nan": None, "i": 3, "b": True, "7": "/a/b", "array": [[1.0, None], [None, -2.0]], "set": [1],
+        "f4": 0.5,
+        "nan": None,
+        "i": 3,
+        "b": True,
+        "7": "/a/b",
+        "array": [[1.0, None], [None, -2.0]],
+        "set": [1],
         "double": None,
-    }  # fmt: skip
+    }
     assert strictly(json_text({"a\udcff": Path("b\udcff"), "c": "\udcff"})) == {r"a\udcff": r"b\udcff", "c": r"\udcff"}
     assert json_ready(Spread(mean=1, std=2, n=3)).startswith("mean=1")
     assert strictly(json_log_line({"a": float("nan")}, default=str, sort_keys=True)) == {"a": None}
@@ -159,4 +182,3 @@ def test_commands_on_a_folder_without_figures_print_json(empty: Report, tmp_path
     with np.load(out / "cloud.npz") as stored:
         strictly(str(stored["attributes"]))
     strictly((out / "cloud.zarr" / "zarr.json").read_text("utf-8"))
-

@@ -95,9 +95,11 @@ def test_heavy_modules_are_recognised() -> None:
 
 def leaves() -> list[type[SpecimapError]]:
     return [
-        leaf for module in (errors, service_errors) for _, leaf in inspect.getmembers(module, inspect.isclass)
+        leaf
+        for module in (errors, service_errors)
+        for _, leaf in inspect.getmembers(module, inspect.isclass)
         if issubclass(leaf, SpecimapError) and leaf.__module__ == module.__name__
-    ]  # fmt: skip
+    ]
 
 
 def test_each_error_has_its_own_code_and_a_status() -> None:
@@ -136,8 +138,10 @@ def test_lock_pins_what_the_project_asks_for() -> None:
     from packaging.utils import canonicalize_name
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    wanted = [*project["dependencies"], *(r for extra in ("infra", "service", "pipeline", "dev")
-                                          for r in project["optional-dependencies"][extra])]  # fmt: skip
+    wanted = [
+        *project["dependencies"],
+        *(r for extra in ("infra", "service", "pipeline", "dev") for r in project["optional-dependencies"][extra]),
+    ]
     lines = [line for line in (ROOT / "requirements.lock").read_text("utf-8").splitlines() if line[:1] not in ("", "#")]
     pins = {canonicalize_name(pin.name): pin for pin in map(Requirement, lines)}
     assert len(pins) == len(lines)

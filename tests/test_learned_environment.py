@@ -45,9 +45,16 @@ def bare(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
 
 def run_with(backend: str = "colmap", adjustment: str = "rigid") -> PipelineSettings:
     return settings_from(
-        edge_mm=6.8, dictionary="DICT_4X4_50", method="camera", adjustment=adjustment, r_pc=0.5, r_reg=2.0,
-        backend=backend, features="auto", working_px=1280,
-    )  # fmt: skip
+        edge_mm=6.8,
+        dictionary="DICT_4X4_50",
+        method="camera",
+        adjustment=adjustment,
+        r_pc=0.5,
+        r_reg=2.0,
+        backend=backend,
+        features="auto",
+        working_px=1280,
+    )
 
 
 # ---- who sees them ------------------------------------------------------------------------------------
@@ -62,9 +69,18 @@ print(json.dumps({"event": "done", "seconds": 0}), flush=True)
 
 
 SECRET = (
-    "SPECIMAP_DATABASE_URL", "SPECIMAP_KEY", "AWS_SECRET_ACCESS_KEY", "PGPASSWORD", "DATABASE_URL", "S3_SECRET_KEY",
-    "POSTGRES_PASSWORD", "GITHUB_TOKEN", "google_application_credentials", "API_KEY", "SENTRY_DSN",
-)  # fmt: skip
+    "SPECIMAP_DATABASE_URL",
+    "SPECIMAP_KEY",
+    "AWS_SECRET_ACCESS_KEY",
+    "PGPASSWORD",
+    "DATABASE_URL",
+    "S3_SECRET_KEY",
+    "POSTGRES_PASSWORD",
+    "GITHUB_TOKEN",
+    "google_application_credentials",
+    "API_KEY",
+    "SENTRY_DSN",
+)
 
 
 @pytest.fixture

@@ -38,14 +38,22 @@ def ask(
     """Run a script whose ``run`` has that body."""
     script = folder / "script.py"
     lines = "\n".join("    " + line for line in body.splitlines())
-    script.write_text(f"import json, os, subprocess, sys, time\nimport numpy as np\n\n"
-                      f"def run(request, arrays, step):\n{lines}\n", "utf-8")  # fmt: skip
+    script.write_text(
+        f"import json, os, subprocess, sys, time\nimport numpy as np\n\ndef run(request, arrays, step):\n{lines}\n",
+        "utf-8",
+    )
     scratch = folder / "scratch"
     try:
         return run_child(
-            script, {"factor": 3, "place": folder}, arrays or {}, name="mast3r", steps=STEPS, progress=progress,
-            scratch=scratch, **options,  # type: ignore[arg-type]
-        )  # fmt: skip
+            script,
+            {"factor": 3, "place": folder},
+            arrays or {},
+            name="mast3r",
+            steps=STEPS,
+            progress=progress,
+            scratch=scratch,
+            **options,  # type: ignore[arg-type]
+        )
     finally:
         assert list(scratch.iterdir()) == []
 

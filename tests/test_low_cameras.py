@@ -36,9 +36,13 @@ def low_views(photos: int = 24) -> list[View]:
 def low() -> Phantom:
     """Twenty markers around a specimen 12 mm high."""
     settings = PhantomSettings(
-        seed=8, marker_ids=tuple(range(20)), specimen_mm=(46.0, 40.0, 12.0), photos=24, photo_size=448,
+        seed=8,
+        marker_ids=tuple(range(20)),
+        specimen_mm=(46.0, 40.0, 12.0),
+        photos=24,
+        photo_size=448,
         mesh_divisions=64,
-    )  # fmt: skip
+    )
     phantom = Phantom(settings)
     phantom.__dict__["views"] = low_views()
     return phantom
@@ -139,9 +143,7 @@ def test_photos_of_single_markers_are_said_to_show_nothing_in_common() -> None:
     lens = Intrinsics.centred(224, 224, 1600.0)
     angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     poses = tuple(
-        look_at(
-            np.array([20 * np.cos(a), 20 * np.sin(a), 150.0]), np.array([50 * np.cos(a), 50 * np.sin(a), 0.0]), UP
-        )
+        look_at(np.array([20 * np.cos(a), 20 * np.sin(a), 150.0]), np.array([50 * np.cos(a), 50 * np.sin(a), 0.0]), UP)
         for a in angles
     )
     said = refusal([np.zeros((224, 224, 3), np.uint8)] * 12, lens, poses, low().truth.marker_corners)

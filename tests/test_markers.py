@@ -37,9 +37,7 @@ def pose_errors(solution: MarkerSolution, truth: MarkerScene) -> Floats:
         truth.corners[list(solution.markers)].reshape(-1, 3), solution.scene.corners.reshape(-1, 3)
     )
     back = Pose(R, t)
-    return np.array(
-        [rotation_deg(p @ back, truth.poses[k]) for k, p in zip(index, solution.scene.poses, strict=True)]
-    )
+    return np.array([rotation_deg(p @ back, truth.poses[k]) for k, p in zip(index, solution.scene.poses, strict=True)])
 
 
 @pytest.mark.parametrize("markers", [1, 2, 4, 9])

@@ -17,8 +17,16 @@ from specimap.core.reconstruct.mast3r.metric import network_lens
 from specimap.core.reconstruct.mast3r.settings import VARIABLES, Mast3rSettings, settings_from_environment
 
 SIZES = [
-    (512, 512), (1280, 1280), (1280, 960), (960, 1280), (1280, 853), (1280, 720), (640, 480), (300, 200), (1279, 961),
-]  # fmt: skip
+    (512, 512),
+    (1280, 1280),
+    (1280, 960),
+    (960, 1280),
+    (1280, 853),
+    (1280, 720),
+    (640, 480),
+    (300, 200),
+    (1279, 961),
+]
 
 # ---- photo to network ---------------------------------------------------------------------------------
 
@@ -92,10 +100,18 @@ def test_defaults_are_upstreams() -> None:
 
 def test_every_variable_is_read(tmp_path: Path) -> None:
     given = {
-        "HOME": str(tmp_path), "WEIGHTS": str(tmp_path / "w"), "WEIGHTS_SHA256": "ab", "PYTHON": "py",
-        "DEVICE": "cuda:1", "GRAPH": "swin-3", "SIZE_PX": "384", "SUBSAMPLE": "4", "SCHEDULE": "50, 60",
-        "CONFIDENCE": "2.5", "CACHE": str(tmp_path / "c"),
-    }  # fmt: skip
+        "HOME": str(tmp_path),
+        "WEIGHTS": str(tmp_path / "w"),
+        "WEIGHTS_SHA256": "ab",
+        "PYTHON": "py",
+        "DEVICE": "cuda:1",
+        "GRAPH": "swin-3",
+        "SIZE_PX": "384",
+        "SUBSAMPLE": "4",
+        "SCHEDULE": "50, 60",
+        "CONFIDENCE": "2.5",
+        "CACHE": str(tmp_path / "c"),
+    }
     assert set(given) == set(VARIABLES)
     found = settings_from_environment({f"SPECIMAP_MAST3R_{k}": v for k, v in given.items()})
     assert found == Mast3rSettings(
@@ -105,9 +121,19 @@ def test_every_variable_is_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("DEVICE", "gpu"), ("GRAPH", "swin-0"), ("GRAPH", "all"), ("SIZE_PX", "500"), ("SIZE_PX", "x"), ("SUBSAMPLE", "3"),
-     ("SCHEDULE", "300"), ("SCHEDULE", "0,10"), ("CONFIDENCE", "0.5"), ("CONFIDENCE", "nan")],
-)  # fmt: skip
+    [
+        ("DEVICE", "gpu"),
+        ("GRAPH", "swin-0"),
+        ("GRAPH", "all"),
+        ("SIZE_PX", "500"),
+        ("SIZE_PX", "x"),
+        ("SUBSAMPLE", "3"),
+        ("SCHEDULE", "300"),
+        ("SCHEDULE", "0,10"),
+        ("CONFIDENCE", "0.5"),
+        ("CONFIDENCE", "nan"),
+    ],
+)
 def test_values_that_cannot_be_are_refused(name: str, value: str) -> None:
     with pytest.raises(SettingsError) as caught:
         settings_from_environment({f"SPECIMAP_MAST3R_{name}": value})
@@ -145,8 +171,9 @@ def prepare(img: str, then: Callable[[float], None]) -> None:
 
 
 def test_upstreams_assertion_on_depth_names_the_photo() -> None:
-    with pytest.raises(DepthNotFoundError, match=r"b\.jpg a depth that is not positive") as caught, TypedFailures(
-        ["a.jpg", "b.jpg"]
+    with (
+        pytest.raises(DepthNotFoundError, match=r"b\.jpg a depth that is not positive") as caught,
+        TypedFailures(["a.jpg", "b.jpg"]),
     ):
         prepare("1", anchor_depth_offsets)
     assert caught.value.details == {"photos": ["b.jpg"]}
@@ -167,9 +194,11 @@ def test_other_failures_stay_what_they_are() -> None:
 
 def good_answer() -> dict[str, NDArray[np.float64]]:
     return {
-        "focal": np.ones(2), "cam_to_world": np.stack([np.eye(4)] * 2), "depth": np.ones((2, 3, 3)),
+        "focal": np.ones(2),
+        "cam_to_world": np.stack([np.eye(4)] * 2),
+        "depth": np.ones((2, 3, 3)),
         "confidence": np.ones((2, 3, 3)),
-    }  # fmt: skip
+    }
 
 
 def test_what_is_not_a_number_is_refused_or_dropped() -> None:
@@ -200,6 +229,11 @@ def test_upstreams_bars_become_steps_in_their_order() -> None:
             inner.set_postfix_str("x")
             inner.update(1)
     assert told == [
-        ("pairs", 0.5), ("pairs", 1.0), ("views", 1.0), ("coarse", 0.25), ("coarse", 1.0),
-        ("fine", 0.25), ("fine", 1.0),
-    ]  # fmt: skip
+        ("pairs", 0.5),
+        ("pairs", 1.0),
+        ("views", 1.0),
+        ("coarse", 0.25),
+        ("coarse", 1.0),
+        ("fine", 0.25),
+        ("fine", 1.0),
+    ]

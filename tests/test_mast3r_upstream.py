@@ -31,9 +31,15 @@ ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 def ask(request: dict[str, object], arrays: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.uint8]]]) -> Answer:
     home, python = upstream()
     return run_child(
-        HERE / "mast3r_loader.py", {"home": home, **request}, arrays, name="mast3r", steps={"load": 1.0},
-        progress=lambda share: None, python=python, environment=ONE_THREAD,
-    )  # fmt: skip
+        HERE / "mast3r_loader.py",
+        {"home": home, **request},
+        arrays,
+        name="mast3r",
+        steps={"load": 1.0},
+        progress=lambda share: None,
+        python=python,
+        environment=ONE_THREAD,
+    )
 
 
 def test_images_are_what_upstreams_loader_makes_of_them(tmp_path: Path) -> None:
@@ -60,9 +66,15 @@ def test_a_checkpoint_of_upstreams_kind_is_loaded_whole_or_refused(tmp_path: Pat
     request = {"home": home, "weights": f"{path}.part", "device": "cpu", "seed": 0, "threads": 1}
     with pytest.raises(BackendUnavailableError, match=r"do not fit its network.*decoder_embed"):
         run_child(
-            HERE / "mast3r_real.py", request, {"images": np.zeros((2, 64, 64, 3), np.uint8)}, name="mast3r",
-            steps={"load": 1.0}, progress=lambda share: None, python=python, environment=ONE_THREAD,
-        )  # fmt: skip
+            HERE / "mast3r_real.py",
+            request,
+            {"images": np.zeros((2, 64, 64, 3), np.uint8)},
+            name="mast3r",
+            steps={"load": 1.0},
+            progress=lambda share: None,
+            python=python,
+            environment=ONE_THREAD,
+        )
 
 
 def test_a_network_that_knows_nothing_ends_in_an_answer_or_a_reason(tmp_path: Path) -> None:
@@ -71,15 +83,28 @@ def test_a_network_that_knows_nothing_ends_in_an_answer_or_a_reason(tmp_path: Pa
     home, python = upstream()
     images = np.random.default_rng(0).integers(0, 256, (3, 64, 64, 3), dtype=np.uint8)
     request = {
-        "home": home, "weights": path, "device": "cpu", "seed": 0, "threads": 1, "subsample": 8, "schedule": (5, 5),
-        "pairs": [(0, 1), (0, 2), (1, 2)], "names": ["a", "b", "c"],
-    }  # fmt: skip
+        "home": home,
+        "weights": path,
+        "device": "cpu",
+        "seed": 0,
+        "threads": 1,
+        "subsample": 8,
+        "schedule": (5, 5),
+        "pairs": [(0, 1), (0, 2), (1, 2)],
+        "names": ["a", "b", "c"],
+    }
     shares: list[float] = []
     try:
         answer = run_child(
-            HERE / "mast3r_real.py", request, {"images": images}, name="mast3r", steps=backend.STEPS,
-            progress=shares.append, python=python, environment=ONE_THREAD,
-        )  # fmt: skip
+            HERE / "mast3r_real.py",
+            request,
+            {"images": images},
+            name="mast3r",
+            steps=backend.STEPS,
+            progress=shares.append,
+            python=python,
+            environment=ONE_THREAD,
+        )
     except (PhotosNotConnectedError, DepthNotFoundError):
         pass
     else:

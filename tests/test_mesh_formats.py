@@ -60,9 +60,11 @@ def test_stl(mesh: Mesh, ply: Path, tmp_path: Path) -> None:
 
 def test_stl_of_a_triangle_without_area_has_no_normal(tmp_path: Path) -> None:
     flat = Mesh(
-        np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.int32), np.zeros((3, 3), np.float32),
+        np.zeros((3, 3), np.float32),
+        np.array([[0, 1, 2]], np.int32),
+        np.zeros((3, 3), np.float32),
         np.zeros((3, 3), np.uint8),
-    )  # fmt: skip
+    )
     write_mesh_ply(tmp_path / "flat.ply", flat)
     written = export_mesh(tmp_path / "flat.ply", tmp_path / "flat.stl", "stl").read_bytes()
     assert written[84:] == bytes(50)

@@ -44,9 +44,13 @@ def shift_in(stage2: Stage2, cube: Cube) -> Shift | None:
     camera = solve_camera(*seen.flat(), cube.rows, cube.cols)
     corners = stage2.adjusted.corners
     return specimen_shift(
-        found.image, camera.view, RayCaster(stage2.mesh), corners, markers_in_cube=len(found.marker_ids),
+        found.image,
+        camera.view,
+        RayCaster(stage2.mesh),
+        corners,
+        markers_in_cube=len(found.marker_ids),
         mirrored=found.mirrored,
-    )  # fmt: skip
+    )
 
 
 def cube_of(settings: PhantomSettings, folder: Path) -> Cube:
@@ -91,9 +95,12 @@ def test_a_still_specimen_is_left_in_peace(finished: Finished, tmp_path: Path, r
 
 @pytest.mark.parametrize(
     "change",
-    [{"seed": 2, "gloss": 0.6}, {"seed": 3, "card_tilt_deg": 2.5, "card_lift_mm": 0.5, "texture_contrast": 0.2},
-     {"seed": 4, "blur_px": 0.8, "exposure_spread": 0.4}],
-)  # fmt: skip
+    [
+        {"seed": 2, "gloss": 0.6},
+        {"seed": 3, "card_tilt_deg": 2.5, "card_lift_mm": 0.5, "texture_contrast": 0.2},
+        {"seed": 4, "blur_px": 0.8, "exposure_spread": 0.4},
+    ],
+)
 def test_defects_are_not_taken_for_motion(tmp_path: Path, change: dict[str, object]) -> None:
     settings = replace(LARGER, photos=10, **change)  # type: ignore[arg-type]
     phantom = phantom_on_disk(tmp_path / "phantom", settings)

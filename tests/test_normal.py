@@ -17,9 +17,13 @@ def equations(*, lens_known: bool = False) -> tuple[Floats, Floats, Floats, Floa
     photo, marker = (x.ravel() for x in np.indices((PHOTOS, MARKERS)))
     start = LENS + 6 * PHOTOS
     columns = np.concatenate(
-        [np.tile(np.arange(LENS), (len(photo), 1)), LENS + 6 * photo[:, None] + np.arange(6),
-         start + 6 * marker[:, None] + np.arange(6)], axis=1,
-    )  # fmt: skip
+        [
+            np.tile(np.arange(LENS), (len(photo), 1)),
+            LENS + 6 * photo[:, None] + np.arange(6),
+            start + 6 * marker[:, None] + np.arange(6),
+        ],
+        axis=1,
+    )
     J, r = rng.standard_normal((len(photo), 8, columns.shape[1])), rng.standard_normal((len(photo), 8))
     if lens_known:
         J[..., :LENS] = 0

@@ -43,10 +43,13 @@ def ring(count: int = 12, distance_mm: float = 150.0) -> tuple[Pose, ...]:
 def written(folder: Path, lens: Intrinsics, poses: tuple[Pose, ...], images: list[NDArray[np.uint8]]) -> None:
     plain = patchmatch.pinhole(lens)
     write_workspace(
-        folder, patchmatch.undistorted(images, lens), np.array([plain.focal_px, plain.cx, plain.cy]),
-        np.stack([p.R for p in poses]), np.stack([p.t for p in poses]),
+        folder,
+        patchmatch.undistorted(images, lens),
+        np.array([plain.focal_px, plain.cx, plain.cy]),
+        np.stack([p.R for p in poses]),
+        np.stack([p.t for p in poses]),
         patchmatch.choose_sources(poses, VOLUME.centre, DepthSettings()),
-    )  # fmt: skip
+    )
 
 
 def test_colmap_reads_our_cameras_to_a_thousandth_of_a_pixel(tmp_path: Path) -> None:
@@ -147,11 +150,17 @@ def test_the_child_asks_for_consistent_depth_in_the_volume_and_tells_how_far_it_
 
     monkeypatch.setattr(pycolmap, "patch_match_stereo", colmap)
     told: list[tuple[str, float]] = []
-    arrays = {"images": np.zeros((6, 160, 200, 3), np.uint8),
-              "pinhole": np.array([plain.focal_px, plain.cx, plain.cy]),
-              "R": np.stack([p.R for p in poses]), "t": np.stack([p.t for p in poses])}  # fmt: skip
-    request = {"folder": str(tmp_path), "depth_mm": [90.0, 210.0],
-               "sources": patchmatch.choose_sources(poses, VOLUME.centre, DepthSettings())}  # fmt: skip
+    arrays = {
+        "images": np.zeros((6, 160, 200, 3), np.uint8),
+        "pinhole": np.array([plain.focal_px, plain.cx, plain.cy]),
+        "R": np.stack([p.R for p in poses]),
+        "t": np.stack([p.t for p in poses]),
+    }
+    request = {
+        "folder": str(tmp_path),
+        "depth_mm": [90.0, 210.0],
+        "sources": patchmatch.choose_sources(poses, VOLUME.centre, DepthSettings()),
+    }
     found, facts = run(request, arrays, lambda step, share: told.append((step, share)))
     assert found["depth"][:, 3, 5].tolist() == [100, 101, 102, 103, 104, 105]
     assert facts == {"photos": 6}

@@ -82,14 +82,16 @@ def test_maps_lie_on_the_surface_and_false_depth_is_not_trusted(scene: Scene) ->
 def call(scene: Scene, device: str, **more: object) -> tuple[list[DepthMap], tuple[tuple[str, str], ...]]:
     settings = replace(DepthSettings(), device=device)  # type: ignore[arg-type]
     return patchmatch.measure_depth(
-        scene.images, scene.lens, scene.poses, scene.volume, settings,
+        scene.images,
+        scene.lens,
+        scene.poses,
+        scene.volume,
+        settings,
         **{"workers": 2, "progress": lambda share: None, **more},  # type: ignore[arg-type]
-    )  # fmt: skip
+    )
 
 
-def test_without_cuda_a_gpu_is_refused_and_auto_takes_the_cpu(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_cuda_a_gpu_is_refused_and_auto_takes_the_cpu(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pycolmap, "has_cuda", False)
     with pytest.raises(BackendUnavailableError, match="without CUDA") as refused:
         call(scene, "gpu")
@@ -119,14 +121,19 @@ def on_gpu(scene: Scene, monkeypatch: pytest.MonkeyPatch, script: Path) -> None:
     monkeypatch.setattr(patchmatch, "patchmatch_depth", lambda *a, **k: whole(*a, **k, child=script))
 
 
-def test_a_gpu_in_sight_is_taken_and_said(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_gpu_in_sight_is_taken_and_said(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     np.save(tmp_path / "depth.npy", scene.exact)
-    on_gpu(scene, monkeypatch, child(tmp_path, f"""
+    on_gpu(
+        scene,
+        monkeypatch,
+        child(
+            tmp_path,
+            f"""
     step("depth", 0.5)
     assert arrays["images"].shape[:3] == {scene.exact.shape}
-    return {{"depth": np.load({str(tmp_path / "depth.npy")!r})}}, {{}}"""))  # fmt: skip
+    return {{"depth": np.load({str(tmp_path / "depth.npy")!r})}}, {{}}""",
+        ),
+    )
     heard: list[float] = []
     maps, said = call(scene, "auto", progress=heard.append)
     assert [code for code, _ in said] == ["dense_on_gpu"]
@@ -166,9 +173,7 @@ def test_the_real_child_says_that_colmap_lacks_cuda(scene: Scene) -> None:
     if patchmatch.what_is_missing() is None:
         pytest.skip("PatchMatch can run here")
     with pytest.raises(BackendFailedError, match="CUDA"):
-        patchmatch.patchmatch_depth(
-            scene.images, scene.lens, scene.poses, scene.volume, DepthSettings(), workers=2
-        )
+        patchmatch.patchmatch_depth(scene.images, scene.lens, scene.poses, scene.volume, DepthSettings(), workers=2)
 
 
 def test_depth_on_a_gpu_makes_as_true_a_cloud(data_dir: Path, tmp_path: Path) -> None:

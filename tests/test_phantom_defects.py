@@ -74,9 +74,7 @@ def test_a_motion_of_zero_is_none() -> None:
     np.testing.assert_array_equal(displacement(STILL).matrix, np.eye(4))
 
 
-@pytest.mark.parametrize(
-    "change", [{"moved_mm": (np.nan, 0.0, 0.0)}, {"moved_deg": np.inf}, {"moved_tilt_deg": 45.0}]
-)
+@pytest.mark.parametrize("change", [{"moved_mm": (np.nan, 0.0, 0.0)}, {"moved_deg": np.inf}, {"moved_tilt_deg": 45.0}])
 def test_a_motion_out_of_range_is_refused(change: dict[str, object]) -> None:
     with pytest.raises(SettingsError) as refused:
         replace(STILL, **change)  # type: ignore[arg-type]

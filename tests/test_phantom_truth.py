@@ -45,8 +45,12 @@ def test_a_seed_repeats_and_another_differs(tmp_path: Path) -> None:
         write_phantom(replace(TINY, seed=seed), tmp_path / name)
     files = sorted(f.relative_to(tmp_path / "a") for f in (tmp_path / "a").rglob("*") if f.is_file())
     assert [str(f) for f in files] == [
-        "hsi/hsi.hdr", "hsi/hsi.raw", "rgb/view_000.jpg", "rgb/view_001.jpg", "truth.npz",
-    ]  # fmt: skip
+        "hsi/hsi.hdr",
+        "hsi/hsi.raw",
+        "rgb/view_000.jpg",
+        "rgb/view_001.jpg",
+        "truth.npz",
+    ]
     for file in files:
         first, again, other = ((tmp_path / k / file).read_bytes() for k in "abc")
         assert first == again
@@ -134,9 +138,17 @@ def test_cards_are_tilted_and_lifted_clear_of_the_tray() -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"photos": 0}, {"edge_mm": 0.0}, {"marker_ids": ()}, {"marker_ids": (1, 1)}, {"noise": -1.0},
-     {"wavelength_nm": (900.0, 400.0)}, {"specimen_mm": (0.0, 20.0, 10.0)}, {"noise": float("nan")}],
-)  # fmt: skip
+    [
+        {"photos": 0},
+        {"edge_mm": 0.0},
+        {"marker_ids": ()},
+        {"marker_ids": (1, 1)},
+        {"noise": -1.0},
+        {"wavelength_nm": (900.0, 400.0)},
+        {"specimen_mm": (0.0, 20.0, 10.0)},
+        {"noise": float("nan")},
+    ],
+)
 def test_settings_out_of_range_are_refused(change: dict[str, object]) -> None:
     with pytest.raises(SettingsError) as refused:
         replace(SMALL, **change)  # type: ignore[arg-type]

@@ -24,9 +24,15 @@ from specimap.core.photoformats import FORMATS, MEDIA_TYPES, PHOTO_SUFFIXES, suf
 
 WITH_EXIF = ["JPEG", "MPO", "HEIF", "PNG", "TIFF", "WEBP", "AVIF"]
 UPRIGHT: dict[int, Any] = {
-    1: lambda a: a, 2: np.fliplr, 3: lambda a: np.rot90(a, 2), 4: np.flipud, 5: lambda a: np.swapaxes(a, 0, 1),
-    6: lambda a: np.rot90(a, -1), 7: lambda a: np.rot90(np.swapaxes(a, 0, 1), 2), 8: np.rot90,
-}  # fmt: skip
+    1: lambda a: a,
+    2: np.fliplr,
+    3: lambda a: np.rot90(a, 2),
+    4: np.flipud,
+    5: lambda a: np.swapaxes(a, 0, 1),
+    6: lambda a: np.rot90(a, -1),
+    7: lambda a: np.rot90(np.swapaxes(a, 0, 1), 2),
+    8: np.rot90,
+}
 """How what the sensor read is turned upright, by the EXIF standard's table of orientations."""
 TURNS = {1: 0, 2: 0, 3: 2, 4: 2, 5: 1, 6: 1, 7: 3, 8: 3}
 
@@ -142,8 +148,10 @@ def test_what_is_passed_over_is_named(tmp_path: Path) -> None:
     found = photo_folder(tmp_path)
     assert [p.name for p in found.photos] == ["a.JPG", "b.HIF", "c.DNG"]
     assert dict(found.passed_over) == {
-        "day 2": "a folder with 1 photo", "empty": "a folder", "film.mov": "its name does not end as a photo's",
-    }  # fmt: skip
+        "day 2": "a folder with 1 photo",
+        "empty": "a folder",
+        "film.mov": "its name does not end as a photo's",
+    }
     ((code, sentence),) = found.remarks()
     assert code == "files_passed_over"
     assert all(name in sentence for name, _ in found.passed_over)

@@ -26,8 +26,12 @@ def judged(out: Path, truth: Truth) -> TruthComparison:
     rows = [truth.marker_ids.tolist().index(i) for i in ids]
     cloud = Cloud.open(out / "cloud.zarr")
     return compare_with_truth(
-        cloud.hsi_pixel, cloud.xyz, corners, truth.marker_corners[rows], truth.hsi_xyz.astype(float),
-        truth.hsi_class == 1
+        cloud.hsi_pixel,
+        cloud.xyz,
+        corners,
+        truth.marker_corners[rows],
+        truth.hsi_xyz.astype(float),
+        truth.hsi_class == 1,
     )
 
 
@@ -64,9 +68,12 @@ def test_spectra_and_flags_are_those_of_their_pixels(finished: Finished, small: 
 def test_a_run_repeats(finished: Finished, small: OnDisk, tmp_path: Path) -> None:
     heard: list[tuple[str, float]] = []
     run_pipeline(
-        Inputs(small.photos, small.header), tmp_path / "out", PipelineSettings(),
-        progress=lambda stage, share: heard.append((stage, share)), workers=1,
-    )  # fmt: skip
+        Inputs(small.photos, small.header),
+        tmp_path / "out",
+        PipelineSettings(),
+        progress=lambda stage, share: heard.append((stage, share)),
+        workers=1,
+    )
     assert_same_result(tmp_path / "out", finished.out)
     stages = list(dict.fromkeys(stage for stage, _ in heard))
     assert stages == ["reconstruct", "adjust", "render", "register"]
@@ -90,9 +97,12 @@ def test_a_stop_is_heard_in_every_stage(finished: Finished, small: OnDisk, tmp_p
         (out / "report.json").unlink()
         with pytest.raises(CancelledError) as stopped:
             run_pipeline(
-                Inputs(small.photos, small.header), out, PipelineSettings(),
-                progress=partial(_note, now), cancelled=partial(now.__contains__, stage),
-            )  # fmt: skip
+                Inputs(small.photos, small.header),
+                out,
+                PipelineSettings(),
+                progress=partial(_note, now),
+                cancelled=partial(now.__contains__, stage),
+            )
         assert stopped.value.details["stage"] == stage
         assert not (out / "report.json").exists()
         assert not list(out.glob(".*.tmp"))

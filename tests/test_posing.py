@@ -105,9 +105,7 @@ def test_auto_takes_a_pose_of_few_matches_only_where_aliked_finds_none(
     assert scene.errors_deg(posed.photos, posed.poses, posed.corners, [0, 1, 2, 3]).max() < 2
 
 
-def test_without_aliked_a_pose_of_few_matches_is_taken_at_once(
-    scene: Ring, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_aliked_a_pose_of_few_matches_is_taken_at_once(scene: Ring, monkeypatch: pytest.MonkeyPatch) -> None:
     installed(monkeypatch, "torch")
     monkeypatch.setattr(reaching, "SURE_INLIERS", 10_000)
     asked = kinds_are(monkeypatch, sift=Sift)
@@ -145,9 +143,7 @@ def test_aliked_that_is_absent_is_refused_first(scene: Ring, monkeypatch: pytest
 
 
 @pytest.mark.parametrize("least", [posing.LEAST_BY_MARKERS, 99], ids=["located", "motion"])
-def test_a_stop_is_heard_while_features_are_at_work(
-    scene: Ring, monkeypatch: pytest.MonkeyPatch, least: int
-) -> None:
+def test_a_stop_is_heard_while_features_are_at_work(scene: Ring, monkeypatch: pytest.MonkeyPatch, least: int) -> None:
     class StopError(Exception):
         pass
 

@@ -245,8 +245,11 @@ def test_answers_pass_unchanged_and_say_that_tls_is_a_must(proxy: Proxy) -> None
 def test_the_file_is_formatted_as_caddy_does(tmp_path: Path) -> None:
     done = subprocess.run(
         [str(CADDY), "fmt", "--diff", str(ROOT / "docker" / "proxy" / "Caddyfile")],
-        capture_output=True, text=True, timeout=30, env={**os.environ, "HOME": str(tmp_path)},
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=30,
+        env={**os.environ, "HOME": str(tmp_path)},
+    )
     assert done.returncode == 0, done.stdout + done.stderr
 
 

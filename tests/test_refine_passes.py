@@ -143,9 +143,16 @@ def test_progress_rises_to_one() -> None:
     scene = matched(SEEDS[0])
     heard: list[float] = []
     refine_mesh(
-        scene.mesh, scene.greys, scene.lens, scene.poses, scene.voxel_mm, SETTINGS,
-        workers=2, worth=scene.worth, progress=heard.append,
-    )  # fmt: skip
+        scene.mesh,
+        scene.greys,
+        scene.lens,
+        scene.poses,
+        scene.voxel_mm,
+        SETTINGS,
+        workers=2,
+        worth=scene.worth,
+        progress=heard.append,
+    )
     assert len(heard) > 2 * len(SETTINGS.passes)
     assert heard == sorted(heard)
     assert heard[0] > 0
@@ -164,7 +171,14 @@ def test_a_stop_raised_by_progress_ends_the_work(after: int) -> None:
 
     with pytest.raises(CancelledError):
         refine_mesh(
-            scene.mesh, scene.greys, scene.lens, scene.poses, scene.voxel_mm, SETTINGS,
-            workers=2, worth=scene.worth, progress=stop,
-        )  # fmt: skip
+            scene.mesh,
+            scene.greys,
+            scene.lens,
+            scene.poses,
+            scene.voxel_mm,
+            SETTINGS,
+            workers=2,
+            worth=scene.worth,
+            progress=stop,
+        )
     assert len(heard) == after + 1

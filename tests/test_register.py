@@ -73,8 +73,10 @@ def test_the_camera_removes_the_parallax_that_the_homography_leaves(caster: RayC
     homography = fit_homography(corners, pixels, coarse, 3.0)
     by_homography = place_by_homography(homography, coarse, fine, camera.view, caster, False)
     on_bump = [p.xyz[:, 2] > 3 for p in (by_camera, by_homography)]
-    placed = [errors_on_surface(p.xyz.astype(float)[k], p.pixels[k])
-              for p, k in zip((by_camera, by_homography), on_bump, strict=True)]  # fmt: skip
+    placed = [
+        errors_on_surface(p.xyz.astype(float)[k], p.pixels[k])
+        for p, k in zip((by_camera, by_homography), on_bump, strict=True)
+    ]
     assert 0.001 < np.median(placed[0]) < 0.06
     assert 0.08 < np.median(placed[1]) < 1.0
     assert homography.inliers.all()
@@ -155,7 +157,8 @@ class MemoryCube:
         return np.where(finite.any(-1), total, np.nan).astype(np.float32)
 
 
-def marker_cube(ids: tuple[int, ...] = (0, 1, 2, 3), *, bands: int = 8, shown: slice = slice(None), noise: float = 0.01
+def marker_cube(
+    ids: tuple[int, ...] = (0, 1, 2, 3), *, bands: int = 8, shown: slice = slice(None), noise: float = 0.01
 ) -> MemoryCube:
     """White paper with four markers of 36 pixels that show in the bands ``shown``, and noise."""
     paper = np.full((160, 200, bands), 0.7, np.float32)

@@ -18,8 +18,13 @@ from specimap.core.phantom import PhantomSettings, write_phantom
 from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline
 
 MEDIUM: dict[str, Any] = {
-    "photos": 18, "photo_size": 448, "cube_rows": 256, "cube_cols": 320, "bands": 16, "mesh_divisions": 96,
-}  # fmt: skip
+    "photos": 18,
+    "photo_size": 448,
+    "cube_rows": 256,
+    "cube_cols": 320,
+    "bands": 16,
+    "mesh_divisions": 96,
+}
 PHANTOMS = {
     "sharp": PhantomSettings(seed=61, **MEDIUM),
     "blurred": PhantomSettings(
@@ -79,9 +84,10 @@ def test_stated_deviations_are_not_too_small_where_they_were_set(setter: Shares)
 
 
 @pytest.mark.xfail(
-    strict=True, raises=AssertionError,
+    strict=True,
+    raises=AssertionError,
     reason="sigma is too large there: 76.5 % within one, since the error fell by a sixth and sigma did not follow",
-)  # fmt: skip
+)
 def test_stated_deviations_hold_where_they_were_set(setter: Shares) -> None:
     assert_near(setter, 0.06, 0.04)
 

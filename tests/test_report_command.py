@@ -144,12 +144,17 @@ def test_what_the_pdf_says(finished: Finished, tmp_path: Path) -> None:
     text = " ".join(told.stdout.split())
     report = finished.report
     for said in (
-        "Accuracy report", "Verdict", "Not a medical device",
+        "Accuracy report",
+        "Verdict",
+        "Not a medical device",
         f"{report.corner_2d_mm.mean:.3f} ± {report.corner_2d_mm.std:.3f}",
         f"{report.leave_one_marker_out_mm.median:.3f} ({report.leave_one_marker_out_mm.maximum:.3f})"
-        if report.leave_one_marker_out_mm else "No marker could be left out",
-        f"{len(report.photos.used)} of {report.photos.given}", report.photos.used[-1], "adjust.edge_mm",
-    ):  # fmt: skip
+        if report.leave_one_marker_out_mm
+        else "No marker could be left out",
+        f"{len(report.photos.used)} of {report.photos.given}",
+        report.photos.used[-1],
+        "adjust.edge_mm",
+    ):
         assert said in text
 
 

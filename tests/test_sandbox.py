@@ -91,10 +91,17 @@ def told(tmp_path: Path) -> Iterator[dict[str, Any]]:
         abstract.listen()
         queue = escapes.LIBRARY.msgget(0, 0o600)
         yield {
-            "secret": str(elsewhere / "secret"), "elsewhere": str(elsewhere), "database": str(database),
-            "parent": os.getpid(), "tcp": tcp.getsockname()[1], "udp": udp.getsockname()[1],
-            "unix": str(tmp_path / "s"), "abstract": name, "datagrams": str(tmp_path / "d"), "queue": queue,
-        }  # fmt: skip
+            "secret": str(elsewhere / "secret"),
+            "elsewhere": str(elsewhere),
+            "database": str(database),
+            "parent": os.getpid(),
+            "tcp": tcp.getsockname()[1],
+            "udp": udp.getsockname()[1],
+            "unix": str(tmp_path / "s"),
+            "abstract": name,
+            "datagrams": str(tmp_path / "d"),
+            "queue": queue,
+        }
         escapes.LIBRARY.msgctl(queue, 0, None)
 
 
@@ -181,10 +188,20 @@ def test_they_lead_out_where_nothing_is_confined(kind: str, told: dict[str, Any]
     found = KINDS[kind](told, tmp_path / "own", "off")
     # These depend on rights of the user and on the kernel, with or without us.
     moody = {
-        "use io_uring", "trace the parent", "read the parent's memory", "open the parent's memory", "read a disk",
-        "read /etc/shadow", "list the parent's open files", "make a namespace", "read it by the parent's root",
-        "be another user", "make a device", "change the attributes of an open file", "change a file's attributes",
-    }  # fmt: skip
+        "use io_uring",
+        "trace the parent",
+        "read the parent's memory",
+        "open the parent's memory",
+        "read a disk",
+        "read /etc/shadow",
+        "list the parent's open files",
+        "make a namespace",
+        "read it by the parent's root",
+        "be another user",
+        "make a device",
+        "change the attributes of an open file",
+        "change a file's attributes",
+    }
     assert {name: how for name, how in found.items() if how != "out" and name not in moody} == {}
 
 
@@ -194,8 +211,11 @@ def test_no_capability_is_left(tmp_path: Path) -> None:
     for code in (program, inner):
         done = subprocess.run(
             confined([sys.executable, "-c", code], Reach(write=[tmp_path], read=[Path("/proc")]), "require"),
-            capture_output=True, text=True, timeout=60, check=True,
-        )  # fmt: skip
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=True,
+        )
         assert done.stdout.split() == ["0" * 16] * 5 + ["1"]
 
 

@@ -97,11 +97,12 @@ def test_a_scan_starts_where_it_sees_the_plane_as_shown(model: object) -> None:
 # ---- phantoms -----------------------------------------------------------------------------------------
 
 CUBES: tuple[dict[str, object], ...] = (
-    {"cube_aspect": 0.7}, {"cube_k1": 0.5},
+    {"cube_aspect": 0.7},
+    {"cube_k1": 0.5},
     {"cube_scan": "rows", "scan_pitch_deg": 8.0, "scan_skew": 0.05},
     {"cube_scan": "columns", "cube_aspect": 1.4, "cube_rotation_deg": 30.0},
     {"cube_scan": "rows", "scan_wobble_mm": 0.3},
-)  # fmt: skip
+)
 
 
 def settings(change: dict[str, object]) -> PhantomSettings:

@@ -46,14 +46,23 @@ class Served:
 @contextmanager
 def running(folder: Path, *arguments: str, **settings: str) -> Iterator[Served]:
     environment = {
-        **os.environ, "SPECIMAP_DATA_DIR": str(folder), "SPECIMAP_PORT": "0", "SPECIMAP_LOG_LEVEL": "warning",
-        "SPECIMAP_LEASE_SECONDS": "4", "SPECIMAP_HEARTBEAT_SECONDS": "1", "SPECIMAP_MIN_FREE_BYTES": "0",
-        "PYTHONUNBUFFERED": "1", **settings,
-    }  # fmt: skip
+        **os.environ,
+        "SPECIMAP_DATA_DIR": str(folder),
+        "SPECIMAP_PORT": "0",
+        "SPECIMAP_LOG_LEVEL": "warning",
+        "SPECIMAP_LEASE_SECONDS": "4",
+        "SPECIMAP_HEARTBEAT_SECONDS": "1",
+        "SPECIMAP_MIN_FREE_BYTES": "0",
+        "PYTHONUNBUFFERED": "1",
+        **settings,
+    }
     process = subprocess.Popen(
-        [*PROGRAM, *(arguments or ("serve",))], env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        [*PROGRAM, *(arguments or ("serve",))],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
         text=True,
-    )  # fmt: skip
+    )
     served = Served(process)
     assert process.stdout is not None
     reader = threading.Thread(target=lambda out=process.stdout: served.lines.extend(iter(out.readline, "")))

@@ -23,9 +23,15 @@ HEADER = (SAMPLES / "hsi" / "hsi.hdr").read_bytes()
 def add_job(service: Running, acquisition: str, state: str) -> str:
     with service.database.session() as session:
         job = Job(
-            id=new_id("job"), acquisition_id=acquisition, settings={}, priority=5, state=state, request_hash="x",
-            correlation_id="x", created_by="x",
-        )  # fmt: skip
+            id=new_id("job"),
+            acquisition_id=acquisition,
+            settings={},
+            priority=5,
+            state=state,
+            request_hash="x",
+            correlation_id="x",
+            created_by="x",
+        )
         session.add(job)
         session.flush()
         session.add(JobEvent(job_id=job.id, seq=1, type="state", data={}))
@@ -55,12 +61,19 @@ def test_made_and_read(service: Running) -> None:
 @pytest.mark.parametrize(
     "wrong",
     [
-        {}, {"specimen_id": ""}, {"specimen_id": "Jane Doe"}, {"specimen_id": "x" * 65}, {"specimen_id": "a\n"},
-        {"specimen_id": "a", "edge_mm": 0}, {"specimen_id": "a", "dictionary": "DICT_4X4_51"},
-        {"specimen_id": "a", "edge_mm": 1e9}, {"specimen_id": "a", "patient": "Doe"},
-        {"specimen_id": "a", "accession_number": "a/b"}, {"specimen_id": "a", "notes": "\0"},
+        {},
+        {"specimen_id": ""},
+        {"specimen_id": "Jane Doe"},
+        {"specimen_id": "x" * 65},
+        {"specimen_id": "a\n"},
+        {"specimen_id": "a", "edge_mm": 0},
+        {"specimen_id": "a", "dictionary": "DICT_4X4_51"},
+        {"specimen_id": "a", "edge_mm": 1e9},
+        {"specimen_id": "a", "patient": "Doe"},
+        {"specimen_id": "a", "accession_number": "a/b"},
+        {"specimen_id": "a", "notes": "\0"},
     ],
-)  # fmt: skip
+)
 def test_wrong_fields_are_refused(service: Running, wrong: dict[str, object]) -> None:
     answer = service.client().post("/v1/acquisitions", json=wrong)
     assert (answer.status_code, answer.json()["code"]) == (422, "request_invalid")
@@ -134,10 +147,17 @@ def test_deleted_with_everything(service: Running) -> None:
     with service.database.session() as session:
         session.add(
             CloudRow(
-                id=new_id("cloud"), job_id=job, acquisition_id=acquisition, prefix=prefix, points=1, bands=1, size=1,
-                report={}, created_at=utc_now(),
+                id=new_id("cloud"),
+                job_id=job,
+                acquisition_id=acquisition,
+                prefix=prefix,
+                points=1,
+                bands=1,
+                size=1,
+                report={},
+                created_at=utc_now(),
             )
-        )  # fmt: skip
+        )
     service.storage.put(f"{prefix}/report.json", b"{}")
     service.storage.put(f"jobs/{job}/adjust/x", b"{}")
     address = f"/v1/acquisitions/{acquisition}"
@@ -169,10 +189,14 @@ def test_several_files_of_several_roles_in_one_form(service: Running) -> None:
     acquisition = new_acquisition(client)
     digest = hashlib.sha256(PHOTO).hexdigest()
     parts: Parts = [
-        ("role", (None, "photo")), ("sha256", (None, digest.upper())), ("file", ("ä b.jpg", PHOTO)),
-        ("file", ("2.jpg", photos()[1].read_bytes())), ("role", (None, "cube")), ("file", ("h.hdr", HEADER)),
+        ("role", (None, "photo")),
+        ("sha256", (None, digest.upper())),
+        ("file", ("ä b.jpg", PHOTO)),
+        ("file", ("2.jpg", photos()[1].read_bytes())),
+        ("role", (None, "cube")),
+        ("file", ("h.hdr", HEADER)),
         ("file", ("h.raw", (SAMPLES / "hsi" / "hsi.raw").read_bytes())),
-    ]  # fmt: skip
+    ]
     answer = client.post(f"/v1/acquisitions/{acquisition}/files", files=parts)
     assert answer.status_code == 201, answer.text
     assert [f["label"] for f in answer.json()] == ["photo-0001.jpg", "photo-0002.jpg", "cube.hdr", "cube.raw"]
@@ -187,7 +211,10 @@ def test_several_files_of_several_roles_in_one_form(service: Running) -> None:
 @pytest.mark.parametrize(
     "body",
     [
-        b"", b"--b--\r\n", b"--b\r\n", b"no form at all",
+        b"",
+        b"--b--\r\n",
+        b"--b\r\n",
+        b"no form at all",
         b'--b\r\nContent-Disposition: form-data; name="file"; filename="x"\r\n\r\nabc\r\n--b--\r\n',
         b'--b\r\nContent-Disposition: form-data; name="role"\r\n\r\nking\r\n--b--\r\n',
         b'--b\r\nContent-Disposition: form-data; name="role"\r\n\r\n' + b"x" * 9999 + b"\r\n--b--\r\n",
@@ -198,7 +225,7 @@ def test_several_files_of_several_roles_in_one_form(service: Running) -> None:
         b'--b\r\nContent-Disposition: form-data; name="role"\r\n\r\nphoto\r\n'
         b'--b\r\nContent-Disposition: form-data; name="file"; filename="x"\r\n\r\n\r\n--b--\r\n',
     ],
-)  # fmt: skip
+)
 def test_forms_that_are_none(service: Running, body: bytes) -> None:
     client = service.client()
     at = f"/v1/acquisitions/{new_acquisition(client)}/files"

@@ -55,12 +55,20 @@ def cloud(served: tuple[httpx.Client, Cloud]) -> Cloud:
 @pytest.mark.parametrize(
     ("accept", "media"),
     [
-        (None, JSON), ("*/*", JSON), ("application/*", JSON), (f"{JSON};q=0.5, {NPY}", NPY),
-        (f"{ARROW}, */*;q=0.1", ARROW), (f"{JSON};q=0, */*", ARROW), ("text/html, */*;q=0.8", JSON),
-        ("APPLICATION/X-NPY", NPY), ("text/html", None), (f"{JSON};q=0", None), ("image/*;q=1, text/*", None),
+        (None, JSON),
+        ("*/*", JSON),
+        ("application/*", JSON),
+        (f"{JSON};q=0.5, {NPY}", NPY),
+        (f"{ARROW}, */*;q=0.1", ARROW),
+        (f"{JSON};q=0, */*", ARROW),
+        ("text/html, */*;q=0.8", JSON),
+        ("APPLICATION/X-NPY", NPY),
+        ("text/html", None),
+        (f"{JSON};q=0", None),
+        ("image/*;q=1, text/*", None),
         (f"{NPY};q=nonsense", None),
     ],
-)  # fmt: skip
+)
 def test_the_form_that_is_accepted(reader: httpx.Client, accept: str | None, media: str | None) -> None:
     body = {"select": {"indices": [0]}}
     for request in (reader.build_request("POST", "spectra", json=body), reader.build_request("GET", "bands/0")):
@@ -123,9 +131,11 @@ def test_what_is_not_known_is_null(service: Running, tmp_path: Path) -> None:
     client, here = service.client(("read",)), f"/v1/clouds/{result.cloud_id}"
     request = {"select": {"indices": [1]}}
     answers = [
-        client.get(here), client.get(f"{here}/points/1"), client.post(f"{here}/spectra", json=request),
+        client.get(here),
+        client.get(f"{here}/points/1"),
+        client.post(f"{here}/spectra", json=request),
         client.get(f"{here}/bands/0"),
-    ]  # fmt: skip
+    ]
     for answer in answers:
         assert answer.status_code == 200
         assert "NaN" not in answer.text

@@ -20,10 +20,16 @@ from specimap.service.multipart import LONGEST_HEADER, MOST_BESIDE, MOST_HEADERS
 CLOUD = f"/v1/clouds/cloud_{'0' * 26}/spectra"
 KINDS = ("application/octet-stream", "application/json", "multipart/form-data; boundary=b", "text/plain", "")
 OF_PATHS = {
-    "acquisition_id": f"acq_{'0' * 26}", "file_id": f"file_{'0' * 26}", "job_id": f"job_{'0' * 26}",
-    "cloud_id": f"cloud_{'0' * 26}", "key_id": f"key_{'0' * 26}", "upload_id": f"up_{'0' * 26}",
-    "uuid": f"up_{'0' * 26}", "name": "layer", "format": "ply",
-}  # fmt: skip
+    "acquisition_id": f"acq_{'0' * 26}",
+    "file_id": f"file_{'0' * 26}",
+    "job_id": f"job_{'0' * 26}",
+    "cloud_id": f"cloud_{'0' * 26}",
+    "key_id": f"key_{'0' * 26}",
+    "upload_id": f"up_{'0' * 26}",
+    "uuid": f"up_{'0' * 26}",
+    "name": "layer",
+    "format": "ply",
+}
 
 
 @pytest.fixture(scope="module")
@@ -119,12 +125,19 @@ def test_a_body_that_says_nothing_is_cut_off(shared: Running) -> None:
 
 
 BODIES = {
-    "deep": b"[" * 50_000, "deeper": b'{"a":' * 900 + b"1" + b"}" * 900, "nothing": b"", "null": b"null",
-    "text": b"\xff\xfe{", "number": b"1e999", "list": b"[]",
+    "deep": b"[" * 50_000,
+    "deeper": b'{"a":' * 900 + b"1" + b"}" * 900,
+    "nothing": b"",
+    "null": b"null",
+    "text": b"\xff\xfe{",
+    "number": b"1e999",
+    "list": b"[]",
     "names": b"{" + b",".join(b'"a%d":1' % i for i in range(4000)) + b"}",
-    "numbers": b'{"scopes":[' + b"1," * 20_000 + b"1]}", "surrogate": b'{"specimen_id":"\\ud800","name":"\\ud800"}',
-    "nan": b'{"edge_mm":NaN,"priority":NaN}', "huge": b'{"priority":' + b"9" * 30_000 + b"}",
-}  # fmt: skip
+    "numbers": b'{"scopes":[' + b"1," * 20_000 + b"1]}",
+    "surrogate": b'{"specimen_id":"\\ud800","name":"\\ud800"}',
+    "nan": b'{"edge_mm":NaN,"priority":NaN}',
+    "huge": b'{"priority":' + b"9" * 30_000 + b"}",
+}
 
 
 def test_no_body_makes_a_route_fail(shared: Running) -> None:

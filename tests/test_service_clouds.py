@@ -38,9 +38,13 @@ def test_one_cloud(service: Running, result: Result) -> None:
     reader = service.client(("read",))
     found, cloud = reader.get(f"/v1/clouds/{result.cloud_id}").json(), result.cloud
     assert {key: found[key] for key in ("id", "job_id", "acquisition_id", "points", "bands", "quantity")} == {
-        "id": result.cloud_id, "job_id": result.job_id, "acquisition_id": result.acquisition_id,
-        "points": cloud.n_points, "bands": 7, "quantity": "reflectance",
-    }  # fmt: skip
+        "id": result.cloud_id,
+        "job_id": result.job_id,
+        "acquisition_id": result.acquisition_id,
+        "points": cloud.n_points,
+        "bands": 7,
+        "quantity": "reflectance",
+    }
     assert found["size"] == sum(p.stat().st_size for p in result.local.rglob("*") if p.is_file())
     np.testing.assert_allclose(found["wavelength_nm"], cloud.wavelengths_nm)
     np.testing.assert_allclose([found["low"], found["high"]], [cloud.xyz.min(0), cloud.xyz.max(0)], rtol=1e-6)
@@ -245,9 +249,10 @@ def test_a_damaged_cloud_says_so_without_naming_files(service: Running, result: 
     path.write_bytes({"shard": b"", "index": content[:-9] + b"x" * 9, "group": b"{", "metadata": b"[]"}[damage])
     reader, here = service.client(("read",)), f"/v1/clouds/{result.cloud_id}"
     answers = [
-        reader.post(f"{here}/spectra", json={"select": {"indices": [3]}}), reader.get(f"{here}/points/3"),
+        reader.post(f"{here}/spectra", json={"select": {"indices": [3]}}),
+        reader.get(f"{here}/points/3"),
         reader.get(f"{here}/bands/3"),
-    ]  # fmt: skip
+    ]
     answers += [reader.get(f"{here}/zarr/zarr.json")] if damage in ("group", "metadata") else []
     for answer in answers:
         assert (answer.status_code, answer.json()["code"]) == (500, "cloud_damaged")

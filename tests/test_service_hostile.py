@@ -96,8 +96,11 @@ def ome(place: str, folder: Path) -> bytes:
 
 
 HOSTILE: dict[str, Callable[[str, Path], bytes]] = {
-    "external": external, "linked": linked, "virtual": virtual, "ome": ome,
-}  # fmt: skip
+    "external": external,
+    "linked": linked,
+    "virtual": virtual,
+    "ome": ome,
+}
 
 
 def secrets_in(folder: Path) -> dict[str, Path]:
@@ -178,9 +181,11 @@ def test_other_formats_that_name_paths_write_and_tell_nothing(tmp_path: Path) ->
         f"header offset = 0\ndata file = {secret}\nwavelength = {{{secret}}}\n"
     )
     files = {
-        "slip.npz": npz({"../../../../made.npy": value.getvalue()}), "absolute.npz": npz({f"{tmp_path}/made": b"x"}),
-        "pickle.npy": pickled.getvalue(), "named.hdr": header.encode(),
-    }  # fmt: skip
+        "slip.npz": npz({"../../../../made.npy": value.getvalue()}),
+        "absolute.npz": npz({f"{tmp_path}/made": b"x"}),
+        "pickle.npy": pickled.getvalue(),
+        "named.hdr": header.encode(),
+    }
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
         archive.writestr(link, str(secret))
@@ -207,11 +212,12 @@ def test_photos_that_are_not_what_they_seem_tell_nothing(tmp_path: Path) -> None
     secret = secrets_in(tmp_path / "elsewhere")["external"]
     beyond = struct.pack("<2sHIHHHII", b"II", 42, 8, 1, 273, 4, 1, 2**31) + bytes(4)
     files = {
-        "offset.tif": beyond, "own.ome.tif": ome(str(secret), tmp_path),
+        "offset.tif": beyond,
+        "own.ome.tif": ome(str(secret), tmp_path),
         "a.svg": f'<svg><image href="file://{secret}"/></svg>'.encode(),
         "a.eps": f"%!PS-Adobe-3.0 EPSF-3.0\n({secret}) (r) file\n".encode(),
         "a.fpx": bytes.fromhex("d0cf11e0a1b11ae1") * 100,
-    }  # fmt: skip
+    }
     with serving(tmp_path / "service") as service:
         client = service.client(("upload", "read"))
         acquisition = new_acquisition(client)
@@ -223,21 +229,39 @@ def test_photos_that_are_not_what_they_seem_tell_nothing(tmp_path: Path) -> None
 # ---- what is believed of a child's answer --------------------------------------------------------------
 
 PHOTO = {
-    "verdict": "accepted", "code": None, "reason": "", "advice": "", "suffix": ".jpg", "width": 512, "height": 512,
-    "sharpness": 0.01, "marker_ids": [0, 1], "dictionary_seen": None,
-}  # fmt: skip
+    "verdict": "accepted",
+    "code": None,
+    "reason": "",
+    "advice": "",
+    "suffix": ".jpg",
+    "width": 512,
+    "height": 512,
+    "sharpness": 0.01,
+    "marker_ids": [0, 1],
+    "dictionary_seen": None,
+}
 WHOLE = {"verdict": "accepted", "code": None, "reason": "", "advice": "", "suffix": ".h5", "part": "whole"}
 
 
 @pytest.mark.parametrize(
     "told",
     [
-        None, [], "accepted", {"died": True}, {**PHOTO, "verdict": "fine"}, {**PHOTO, "suffix": "/../../x"},
-        {**PHOTO, "suffix": ".jpg/../x"}, {**PHOTO, "code": "a b"}, {**PHOTO, "width": "wide"},
-        {**PHOTO, "marker_ids": list(range(MOST_ITEMS + 1))}, {**PHOTO, "sharpness": float("nan")},
-        {**PHOTO, "width": 10**30}, {**PHOTO, "more": [[[[[1]]]]]}, {k: v for k, v in PHOTO.items() if k != "suffix"},
+        None,
+        [],
+        "accepted",
+        {"died": True},
+        {**PHOTO, "verdict": "fine"},
+        {**PHOTO, "suffix": "/../../x"},
+        {**PHOTO, "suffix": ".jpg/../x"},
+        {**PHOTO, "code": "a b"},
+        {**PHOTO, "width": "wide"},
+        {**PHOTO, "marker_ids": list(range(MOST_ITEMS + 1))},
+        {**PHOTO, "sharpness": float("nan")},
+        {**PHOTO, "width": 10**30},
+        {**PHOTO, "more": [[[[[1]]]]]},
+        {k: v for k, v in PHOTO.items() if k != "suffix"},
     ],
-)  # fmt: skip
+)
 def test_an_answer_that_no_reader_gives_is_none(told: object) -> None:
     with pytest.raises(ValueError):  # noqa: PT011 - the message is for nobody
         checked_verdict("photo", told)
@@ -248,9 +272,16 @@ def test_an_answer_is_shortened_and_its_wavelengths_are_plausible() -> None:
     assert len(told["reason"]) <= LONGEST_TEXT
     assert "\x1b" not in told["reason"]
     for given, kept in (
-        ([400, 1000.5], [400, 1000.5]), ([1000, 400], None), ([-1.0, 5], None), ([0.0, 1e300][:1], None),
-        ([1e-9, 2.0], None), ([400, 1e9], None), ("secret", None), ([400, 500, 600], None), (None, None),
-    ):  # fmt: skip
+        ([400, 1000.5], [400, 1000.5]),
+        ([1000, 400], None),
+        ([-1.0, 5], None),
+        ([0.0, 1e300][:1], None),
+        ([1e-9, 2.0], None),
+        ([400, 1e9], None),
+        ("secret", None),
+        ([400, 500, 600], None),
+        (None, None),
+    ):
         assert checked_verdict("part", {**WHOLE, "wavelength_nm": given})["wavelength_nm"] == kept
 
 

@@ -42,14 +42,31 @@ def test_job_is_queued_with_its_workflow_and_first_event(any_service: Running) -
     assert answer.headers["location"] == f"/v1/jobs/{job['id']}"
     assert client.get(answer.headers["location"]).json() == job
     assert job["settings"] == {
-        "method": "camera", "adjustment": "rigid", "r_pc": 0.25, "r_reg": 2.0, "backend": "colmap", "features": "auto",
-        "working_px": 1280, "dictionary": "DICT_4X4_50", "edge_mm": 7.5,
-    }  # fmt: skip
+        "method": "camera",
+        "adjustment": "rigid",
+        "r_pc": 0.25,
+        "r_reg": 2.0,
+        "backend": "colmap",
+        "features": "auto",
+        "working_px": 1280,
+        "dictionary": "DICT_4X4_50",
+        "edge_mm": 7.5,
+    }
     expected: dict[str, Any] = {
-        "acquisition_id": owner, "priority": "intraoperative", "state": "queued", "stage": None, "progress": 0.0,
-        "error": None, "starts": 0, "rerun_of": None, "cloud_id": None, "seconds": {}, "started_at": None,
-        "finished_at": None, "queue_position": 0,
-    }  # fmt: skip
+        "acquisition_id": owner,
+        "priority": "intraoperative",
+        "state": "queued",
+        "stage": None,
+        "progress": 0.0,
+        "error": None,
+        "starts": 0,
+        "rerun_of": None,
+        "cloud_id": None,
+        "seconds": {},
+        "started_at": None,
+        "finished_at": None,
+        "queue_position": 0,
+    }
     assert {name: job[name] for name in expected} == expected
     assert workflows(any_service) == {job["id"]: "ENQUEUED"}
     assert [(e.seq, e.data["state"]) for e in events(any_service.database, job["id"])] == [(1, "queued")]

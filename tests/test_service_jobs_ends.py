@@ -17,20 +17,39 @@ from specimap.infra.models import Acquisition, CloudRow, Delivery, Export, JobEv
 SPREAD = {"mean": 0.1, "std": 0.1, "n": 4}
 QUARTILES = {"median": 0.1, "q1": 0.1, "q3": 0.2, "n": 4}
 REPORT: dict[str, Any] = {
-    "specimap_version": "0.1.0", "created": "2026-11-01T00:00:00Z", "method": "camera", "backend": "colmap",
-    "adjustment": "rigid", "marker_ids": [0, 1, 2, 3], "marker_ids_in_cube": [0, 1, 2, 3], "corner_2d_mm": SPREAD,
-    "corner_3d_mm": QUARTILES, "leave_one_marker_out_mm": None, "methods": {},
-    "edge_length_mm": {**SPREAD, "expected": 6.8}, "corner_sigma_mm": 0.05,
-    "reprojection_px": {"before": 1.0, "after": 0.5}, "photos": {"given": 6, "used": [], "refused": []},
+    "specimap_version": "0.1.0",
+    "created": "2026-11-01T00:00:00Z",
+    "method": "camera",
+    "backend": "colmap",
+    "adjustment": "rigid",
+    "marker_ids": [0, 1, 2, 3],
+    "marker_ids_in_cube": [0, 1, 2, 3],
+    "corner_2d_mm": SPREAD,
+    "corner_3d_mm": QUARTILES,
+    "leave_one_marker_out_mm": None,
+    "methods": {},
+    "edge_length_mm": {**SPREAD, "expected": 6.8},
+    "corner_sigma_mm": 0.05,
+    "reprojection_px": {"before": 1.0, "after": 0.5},
+    "photos": {"given": 6, "used": [], "refused": []},
     "inliers": {"n": 16, "of": 16, "threshold_px": 3.0, "threshold_mm": 6.0},
     "coverage": {"between_markers": 1.0, "points": 10, "specimen_points": 8},
-    "parallax_removed_mm": {"median": 1.0, "maximum": 2.0}, "sigma_mm": {"median": 0.1, "p95": 0.2},
+    "parallax_removed_mm": {"median": 1.0, "maximum": 2.0},
+    "sigma_mm": {"median": 0.1, "p95": 0.2},
     "cube_camera": {
-        "focal_px": 1000.0, "focal_relative_sd": 0.1, "distance_mm": 300.0, "reprojection_rms_px": 0.3,
-        "roll_deg": 0.0, "mirrored": False, "markers_found_in": "band mean",
+        "focal_px": 1000.0,
+        "focal_relative_sd": 0.1,
+        "distance_mm": 300.0,
+        "reprojection_rms_px": 0.3,
+        "roll_deg": 0.0,
+        "mirrored": False,
+        "markers_found_in": "band mean",
     },
-    "photo_focal_px": 1000.0, "seconds": {"register": 2.5}, "reused_stages": [], "warnings": [],
-}  # fmt: skip
+    "photo_focal_px": 1000.0,
+    "seconds": {"register": 2.5},
+    "reused_stages": [],
+    "warnings": [],
+}
 
 
 def succeeded(service: Running, owner: str, prefix: str | None = None) -> tuple[str, str]:
@@ -42,10 +61,16 @@ def succeeded(service: Running, owner: str, prefix: str | None = None) -> tuple[
         jobs.claim(session, job_id, EXECUTOR)
         session.add(
             CloudRow(
-                id=cloud_id, job_id=job_id, acquisition_id=owner, prefix=prefix, points=10, bands=5, size=2,
+                id=cloud_id,
+                job_id=job_id,
+                acquisition_id=owner,
+                prefix=prefix,
+                points=10,
+                bands=5,
+                size=2,
                 report=REPORT,
             )
-        )  # fmt: skip
+        )
         jobs.finish(session, job_id, EXECUTOR, "succeeded", seconds={"register": 2.5})
     return job_id, cloud_id
 
@@ -55,8 +80,10 @@ def test_report_is_there_once_the_job_has_succeeded(service: Running) -> None:
     client = service.client(["read"])
     early = client.get(f"/v1/jobs/{queued_job(service.database, owner)}/report")
     assert (early.status_code, early.json()["code"], early.json()["details"]) == (
-        409, "state_conflict", {"state": "queued"},
-    )  # fmt: skip
+        409,
+        "state_conflict",
+        {"state": "queued"},
+    )
     job_id, cloud_id = succeeded(service, owner)
     assert Report.model_validate(client.get(f"/v1/jobs/{job_id}/report").json()) == Report.model_validate(REPORT)
     job = client.get(f"/v1/jobs/{job_id}").json()
@@ -93,8 +120,11 @@ def test_rerun_keeps_what_is_not_changed(service: Running) -> None:
     assert same.status_code == 202
     assert same.headers["location"] == f"/v1/jobs/{same.json()['id']}"
     assert {name: same.json()[name] for name in ("settings", "priority", "rerun_of", "acquisition_id")} == {
-        "settings": first["settings"], "priority": "research", "rerun_of": first["id"], "acquisition_id": owner,
-    }  # fmt: skip
+        "settings": first["settings"],
+        "priority": "research",
+        "rerun_of": first["id"],
+        "acquisition_id": owner,
+    }
     headers = {"Idempotency-Key": "again"}
     change = {"settings": {"r_reg": 1.0}, "priority": "routine"}
     changed = client.post(f"/v1/jobs/{first['id']}/rerun", json=change, headers=headers)
@@ -141,17 +171,29 @@ def test_deletion_takes_the_results_files_and_spares_those_of_others_and_of_the_
         made = {"created_by": "key_test"}
         session.add(
             LabelVersion(
-                cloud_id=cloud_id, name="tumour", version=1, kind="class", classes=[], made_by={},
-                storage_prefix=f"clouds/{cloud_id}/labels/tumour/v1", sha256="0", **made,
+                cloud_id=cloud_id,
+                name="tumour",
+                version=1,
+                kind="class",
+                classes=[],
+                made_by={},
+                storage_prefix=f"clouds/{cloud_id}/labels/tumour/v1",
+                sha256="0",
+                **made,
             )
-        )  # fmt: skip
+        )
         export_id = new_id("exp")
         session.add(
             Export(
-                id=export_id, cloud_id=cloud_id, format="ply", state="succeeded", correlation_id="",
-                storage_key=f"exports/{export_id}/cloud.ply", **made,
+                id=export_id,
+                cloud_id=cloud_id,
+                format="ply",
+                state="succeeded",
+                correlation_id="",
+                storage_key=f"exports/{export_id}/cloud.ply",
+                **made,
             )
-        )  # fmt: skip
+        )
     stage = f"acquisitions/{owner}/stages/att_1.npz"
     for key in (f"clouds/{cloud_id}/labels/tumour/v1/zarr.json", f"exports/{export_id}/cloud.ply", stage):
         service.storage.put(key, b"1")

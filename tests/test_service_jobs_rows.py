@@ -43,8 +43,11 @@ def test_life_of_a_job_is_told_in_events(tables: Database) -> None:
     job = row(tables, job_id)
     assert (job.state, job.starts, job.executor, job.seconds) == ("failed", 1, EXECUTOR, {"reconstruct": 1.235})
     assert job.error == {
-        "code": "too_few_photos", "message": "Two photos.", "advice": "Take more.", "details": {"found": 2},
-    }  # fmt: skip
+        "code": "too_few_photos",
+        "message": "Two photos.",
+        "advice": "Take more.",
+        "details": {"found": 2},
+    }
     assert job.started_at is not None
     assert job.finished_at is not None
     assert job.created_at <= job.started_at <= job.finished_at

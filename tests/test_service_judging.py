@@ -128,10 +128,13 @@ def test_what_does_not_decode_is_kept_to_be_shown(service: Running, tmp_path: Pa
     acquisition = new_acquisition(client)
     whole = SHARP[0].read_bytes()
     bad = {
-        "text.jpg": b"a letter, not a photo", "cut.jpg": whole[: len(whole) // 2], "bomb.png": one_bit_bomb(),
-        "huge.png": bomb(tmp_path / "huge.png").read_bytes(), "script.ps": b"%!PS-Adobe-3.0\n(%pipe%id) (r) file\n",
+        "text.jpg": b"a letter, not a photo",
+        "cut.jpg": whole[: len(whole) // 2],
+        "bomb.png": one_bit_bomb(),
+        "huge.png": bomb(tmp_path / "huge.png").read_bytes(),
+        "script.ps": b"%!PS-Adobe-3.0\n(%pipe%id) (r) file\n",
         "x.svg": b"<svg onload='alert(1)'/>",
-    }  # fmt: skip
+    }
     for number, (name, data) in enumerate(bad.items(), 1):
         file = sent(client, acquisition, "photo", name, data)
         assert (file["state"], file["judgement"]["code"]) == ("refused", "photo_unreadable"), name

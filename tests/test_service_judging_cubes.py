@@ -88,9 +88,12 @@ def test_headers_that_are_none_or_wrong(service: Running) -> None:
     client = service.client()
     acquisition = new_acquisition(client)
     bad = (
-        (b"a letter", "ENVI"), (HEADER.replace(b"bsq", b"bup"), "interleave"), (HEADER[:40], "description"),
-        (HEADER.replace(b"samples = 464", b"samples = -4"), "samples"), (bytes(range(256)), "ENVI"),
-    )  # fmt: skip
+        (b"a letter", "ENVI"),
+        (HEADER.replace(b"bsq", b"bup"), "interleave"),
+        (HEADER[:40], "description"),
+        (HEADER.replace(b"samples = 464", b"samples = -4"), "samples"),
+        (bytes(range(256)), "ENVI"),
+    )
     for number, (data, field) in enumerate(bad, 1):
         file = sent(client, acquisition, "cube", "x.HDR", data)
         judged = file["judgement"]
@@ -106,9 +109,10 @@ def test_whole_files_and_useless_ones(service: Running, tmp_path: Path) -> None:
     good = random_values("u2", (30, 20, 8))
     np.savez(tmp_path / "x.npz", cube=good)
     for name, data, label in (
-        ("x.npy", npy(good), "cube.npy"), ("scan", npy(good), "cube.npy"),
+        ("x.npy", npy(good), "cube.npy"),
+        ("scan", npy(good), "cube.npy"),
         ("x.npz", (tmp_path / "x.npz").read_bytes(), "cube.npz"),
-    ):  # fmt: skip
+    ):
         acquisition = new_acquisition(client)
         file = sent(client, acquisition, "cube", name, data)
         assert (file["label"], file["judgement"]["verdict"], file["judgement"]["bands"]) == (label, "accepted", 8)
@@ -118,10 +122,11 @@ def test_whole_files_and_useless_ones(service: Running, tmp_path: Path) -> None:
     for name, data, code in (
         ("x.npy", npy(np.full((9, 8, 3), np.nan, "f4")), "cube_content_invalid"),
         ("x.npy", npy(np.zeros((9, 8, 3), "u2")), "cube_content_invalid"),
-        ("x.npy", npy(good)[:-9], "cube_truncated"), ("x.npy", npy(good[0]), "cube_format_unknown"),
+        ("x.npy", npy(good)[:-9], "cube_truncated"),
+        ("x.npy", npy(good[0]), "cube_format_unknown"),
         ("x.h5", b"no HDF5", "cube_format_unknown"),
         ("x.mat", b"MATLAB 5.0 MAT-file" + bytes(200), "cube_format_unknown"),
-    ):  # fmt: skip
+    ):
         file = sent(client, acquisition, "cube", name, data)
         assert (file["state"], file["judgement"]["code"]) == ("refused", code), name
     assert client.get(f"/v1/acquisitions/{acquisition}").json()["files"]["refused"] == 6

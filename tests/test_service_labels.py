@@ -73,8 +73,11 @@ def test_classes_round_trip_in_all_encodings(
     assert label["classes"] == [{"colour": None, **item} for item in CLASSES]
     assert made.headers["etag"] == '"1"'
     # The same content in another encoding is the same version.
-    again = client.put(layer(result), content=arrow({"value": values.astype(np.int16)}, rows=1000),
-                       headers=header() | {"Content-Type": ARROW})  # fmt: skip
+    again = client.put(
+        layer(result),
+        content=arrow({"value": values.astype(np.int16)}, rows=1000),
+        headers=header() | {"Content-Type": ARROW},
+    )
     assert (again.status_code, again.json()) == (200, label)
     assert client.get(layer(result)).json() == label
     assert client.get(f"/v1/clouds/{result.cloud_id}/labels").json() == [label]
@@ -140,9 +143,11 @@ def test_versions_under_concurrent_writers(service: Running, result: Result, val
     def write(number: int) -> httpx.Response:
         mine = values.copy()
         mine[number] = (mine[number] == 0) * 1
-        return clients[number].put(layer(result), content=npy(mine), headers=header(classes=[
-            *CLASSES, {"value": 5, "name": f"writer-{number}"}
-        ]))  # fmt: skip
+        return clients[number].put(
+            layer(result),
+            content=npy(mine),
+            headers=header(classes=[*CLASSES, {"value": 5, "name": f"writer-{number}"}]),
+        )
 
     with ThreadPoolExecutor(8) as pool:
         answers = list(pool.map(write, range(8)))
@@ -224,7 +229,7 @@ def wrong_bodies() -> list[tuple[str, str, dict[str, str], Callable[[NDArray[np.
         ("request_invalid", NPY, {}, npy),
         ("media_type_unsupported", "text/csv", header(), npy),
         ("payload_too_large", NPY, header(), lambda v: npy(v) + bytes(2 * 1024 * 1024)),
-    ]  # fmt: skip
+    ]
 
 
 def test_what_does_not_fit_is_refused_and_leaves_nothing(

@@ -218,14 +218,28 @@ def test_etag_spares_the_drawing(service: Running, client: httpx.Client, result:
 
 
 IMPOSSIBLE: list[tuple[str, dict[str, str], int]] = [
-    ("band", {}, 422), ("band", {"b": "1", "nm": "500"}, 422), ("band", {"b": "x"}, 422), ("band", {"b": "7"}, 404),
-    ("band", {"b": "-1"}, 422), ("band", {"nm": "250"}, 404), ("band", {"b": "1200nm"}, 404),
-    ("band", {"nm": "nan"}, 422), ("band", {"b": "1", "low": "1"}, 422),
-    ("band", {"b": "1", "low": "2", "high": "1"}, 422), ("band", {"b": "1", "low": "nan", "high": "1"}, 422),
-    ("index", {"a": "1"}, 422), ("index", {"a": "1", "b": "99"}, 404), ("composite", {"r": "99999"}, 404),
-    ("rgb", {"size": "4096"}, 422), ("rgb", {"size": "0"}, 422), ("rgb", {"grid": "photo"}, 422),
-    ("label", {}, 422), ("label", {"name": "none"}, 404), ("label", {"name": "../x"}, 422), ("nothing", {}, 404),
-]  # fmt: skip
+    ("band", {}, 422),
+    ("band", {"b": "1", "nm": "500"}, 422),
+    ("band", {"b": "x"}, 422),
+    ("band", {"b": "7"}, 404),
+    ("band", {"b": "-1"}, 422),
+    ("band", {"nm": "250"}, 404),
+    ("band", {"b": "1200nm"}, 404),
+    ("band", {"nm": "nan"}, 422),
+    ("band", {"b": "1", "low": "1"}, 422),
+    ("band", {"b": "1", "low": "2", "high": "1"}, 422),
+    ("band", {"b": "1", "low": "nan", "high": "1"}, 422),
+    ("index", {"a": "1"}, 422),
+    ("index", {"a": "1", "b": "99"}, 404),
+    ("composite", {"r": "99999"}, 404),
+    ("rgb", {"size": "4096"}, 422),
+    ("rgb", {"size": "0"}, 422),
+    ("rgb", {"grid": "photo"}, 422),
+    ("label", {}, 422),
+    ("label", {"name": "none"}, 404),
+    ("label", {"name": "../x"}, 422),
+    ("nothing", {}, 404),
+]
 
 
 def test_what_cannot_be_drawn(client: httpx.Client, result: Result) -> None:

@@ -185,9 +185,10 @@ def test_pages_have_their_limits(reader: httpx.Client, cloud: Cloud) -> None:
 
 def test_nothing_found_is_an_empty_answer(reader: httpx.Client) -> None:
     for select in (
-        {"radius": {"centre": [900, 0, 0], "radius_mm": 1}}, {"pixels": [[65535, 65535]]},
+        {"radius": {"centre": [900, 0, 0], "radius_mm": 1}},
+        {"pixels": [[65535, 65535]]},
         {"polygon": [[900, 900], [900, 910], [910, 900]]},
-    ):  # fmt: skip
+    ):
         body = read(reader, JSON, select, fields=["xyz"]).json()
         assert (body["total"], body["indices"], body["spectra"], body["fields"]) == (0, [], [], {"xyz": []})
         assert table_of(read(reader, ARROW, select, fields=["xyz"]))[0].num_rows == 0
@@ -197,24 +198,44 @@ def test_nothing_found_is_an_empty_answer(reader: httpx.Client) -> None:
 
 ZERO = "[0, 0, 0]"
 BAD = (
-    '{"select": {}}', '{"select": {"indices": [1], "pixels": [[1, 1]]}}', '{"select": {"indices": []}}', "{}", "[]",
-    "{", '{"select": {"indices": [99999]}}', '{"select": {"indices": [-1]}}', '{"select": {"indices": [1.5]}}',
-    '{"select": {"indices": [18446744073709551616]}}', '{"select": {"pixels": []}}', '{"select": {"pixels": [[1]]}}',
-    '{"select": {"pixels": [[-1, 0]]}}', '{"select": {"polygon": []}}', '{"select": {"polygon": [[0, 0], [1, 1]]}}',
-    '{"select": {"polygon": [[0, 0], [1, NaN], [2, 0]]}}', '{"select": {"polygon": [[0, 0], [1, 1e300], [2, 0]]}}',
-    f'{{"select": {{"nearest": {{"xyz": {ZERO}, "k": 0}}}}}}', '{"select": {"nearest": {"xyz": [0, 0, NaN]}}}',
-    '{"select": {"nearest": {"xyz": [0, Infinity, 0]}}}', '{"select": {"nearest": {"xyz": [0, 0]}}}',
+    '{"select": {}}',
+    '{"select": {"indices": [1], "pixels": [[1, 1]]}}',
+    '{"select": {"indices": []}}',
+    "{}",
+    "[]",
+    "{",
+    '{"select": {"indices": [99999]}}',
+    '{"select": {"indices": [-1]}}',
+    '{"select": {"indices": [1.5]}}',
+    '{"select": {"indices": [18446744073709551616]}}',
+    '{"select": {"pixels": []}}',
+    '{"select": {"pixels": [[1]]}}',
+    '{"select": {"pixels": [[-1, 0]]}}',
+    '{"select": {"polygon": []}}',
+    '{"select": {"polygon": [[0, 0], [1, 1]]}}',
+    '{"select": {"polygon": [[0, 0], [1, NaN], [2, 0]]}}',
+    '{"select": {"polygon": [[0, 0], [1, 1e300], [2, 0]]}}',
+    f'{{"select": {{"nearest": {{"xyz": {ZERO}, "k": 0}}}}}}',
+    '{"select": {"nearest": {"xyz": [0, 0, NaN]}}}',
+    '{"select": {"nearest": {"xyz": [0, Infinity, 0]}}}',
+    '{"select": {"nearest": {"xyz": [0, 0]}}}',
     f'{{"select": {{"nearest": {{"xyz": {ZERO}, "k": 100001}}}}}}',
     f'{{"select": {{"box": {{"low": [1, 0, 0], "high": {ZERO}}}}}}}',
     f'{{"select": {{"radius": {{"centre": {ZERO}, "radius_mm": -1}}}}}}',
     f'{{"select": {{"radius": {{"centre": {ZERO}, "radius_mm": NaN}}}}}}',
-    '{"select": {"indices": [1]}, "bands": {}}', '{"select": {"indices": [1]}, "bands": {"indices": [5]}}',
-    '{"select": {"indices": [1]}, "bands": {"indices": []}}', '{"select": {"indices": [1]}, "bands": {"nm": [1, 2]}}',
-    '{"select": {"indices": [1]}, "bands": {"nm": [900, 400]}}', '{"select": {"indices": [1]}, "fields": ["spectra"]}',
-    '{"select": {"indices": [1]}, "bands": {"nm": [400, NaN]}}', '{"select": {"indices": [1]}, "limit": 0}',
-    '{"select": {"indices": [1]}, "limit": 100001}', '{"select": {"indices": [1]}, "offset": -1}',
-    '{"select": {"indices": [1]}, "fields": ["distance_mm"]}', '{"select": {"indices": [1]}, "more": 1}',
-)  # fmt: skip
+    '{"select": {"indices": [1]}, "bands": {}}',
+    '{"select": {"indices": [1]}, "bands": {"indices": [5]}}',
+    '{"select": {"indices": [1]}, "bands": {"indices": []}}',
+    '{"select": {"indices": [1]}, "bands": {"nm": [1, 2]}}',
+    '{"select": {"indices": [1]}, "bands": {"nm": [900, 400]}}',
+    '{"select": {"indices": [1]}, "fields": ["spectra"]}',
+    '{"select": {"indices": [1]}, "bands": {"nm": [400, NaN]}}',
+    '{"select": {"indices": [1]}, "limit": 0}',
+    '{"select": {"indices": [1]}, "limit": 100001}',
+    '{"select": {"indices": [1]}, "offset": -1}',
+    '{"select": {"indices": [1]}, "fields": ["distance_mm"]}',
+    '{"select": {"indices": [1]}, "more": 1}',
+)
 
 
 @pytest.mark.parametrize("body", BAD)

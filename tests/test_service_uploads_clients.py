@@ -28,9 +28,7 @@ def test_tuspy_sends_a_photo_and_a_cube(service: Running, slash: str, checksum: 
     for path, role in ((photos()[0], "photo"), (cube.with_suffix(".raw"), "cube"), (cube, "cube")):
         fields = {"acquisition": acquisition, "role": role, "filename": path.name}
         with open(path, "rb") as stream:
-            uploader = tus.uploader(
-                file_stream=stream, chunk_size=1_000_000, metadata=fields, upload_checksum=checksum
-            )  # fmt: skip
+            uploader = tus.uploader(file_stream=stream, chunk_size=1_000_000, metadata=fields, upload_checksum=checksum)
             uploader.upload()
         told = result(client, str(uploader.url).removeprefix(service.url))
         assert told["file"]["judgement"]["verdict"] == "accepted"
@@ -65,8 +63,12 @@ def test_tus_js_client_goes_on_where_the_network_broke(
     try:
         done = subprocess.run(
             ["node", "upload.js", f"{proxy.url}/v1/uploads", acquisition, "cube", str(file), str(chunk)],
-            cwd=js_client, env={**os.environ, "KEY": key}, capture_output=True, text=True, timeout=60,
-        )  # fmt: skip
+            cwd=js_client,
+            env={**os.environ, "KEY": key},
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
     finally:
         proxy.close()
     assert done.returncode == 0, done.stdout + done.stderr

@@ -81,9 +81,13 @@ def until(client: httpx.Client, at: str, least: int) -> int:
 def half_sent(url: str, at: str, key: str, data: bytes, upto: int) -> socket.socket:
     """A connection on which a PATCH was begun and no more comes."""
     lines = {
-        **TUS, "Host": "x", "Authorization": f"Bearer {key}", "Upload-Offset": "0", "Content-Type": OCTETS,
+        **TUS,
+        "Host": "x",
+        "Authorization": f"Bearer {key}",
+        "Upload-Offset": "0",
+        "Content-Type": OCTETS,
         "Content-Length": str(len(data)),
-    }  # fmt: skip
+    }
     head = f"PATCH {at} HTTP/1.1\r\n" + "".join(f"{k}: {v}\r\n" for k, v in lines.items()) + "\r\n"
     connection = socket.create_connection(("127.0.0.1", int(url.rsplit(":", 1)[1])))
     connection.sendall(head.encode() + data[:upto])

@@ -73,9 +73,11 @@ def test_xarray_reads_reflectance(service: Running, result: Result) -> None:
 
 def test_tensorstore_reads_parts(service: Running, result: Result) -> None:
     store = {
-        "driver": "http", "base_url": f"{service.url}/v1/clouds/{result.cloud_id}/zarr/", "path": "spectra/",
+        "driver": "http",
+        "base_url": f"{service.url}/v1/clouds/{result.cloud_id}/zarr/",
+        "path": "spectra/",
         "headers": [f"Authorization: Bearer {service.key(('read',))}"],
-    }  # fmt: skip
+    }
     array = tensorstore.open({"driver": "zarr3", "kvstore": store}, open=True).result()
     stored = result.cloud.stored_spectra(slice(None))
     np.testing.assert_array_equal(array[300:900].read().result(), stored[300:900])
@@ -111,14 +113,44 @@ def test_the_scope_read_is_needed(service: Running, result: Result) -> None:
 
 
 HOSTILE = (
-    "../report.json", "spectra/../../report.json", "%2e%2e/report.json", "spectra/%2e%2e/%2e%2e/report.json",
-    "spectra%2Fzarr.json", "spectra%2fc%2f0%2f0", "..%5creport.json", "..\\report.json", "/etc/passwd",
-    "/spectra/zarr.json", "//spectra/zarr.json", "./zarr.json", "spectra//zarr.json", "spectra/./zarr.json",
-    "spectra", "spectra/", "spectra/c", "", "zarr.json/", "zarr.json%00", "spectra/zarr.json%00.png", "labels",
-    "labels/", "labels/zarr.json", "labels/../xyz/zarr.json", "labels/tissue/zarr.json", ".zgroup", "spectra/.zarray",
-    "report.json", "mesh.ply", "c/0", "spectra/c/0/0/0", "spectra/c/4/0", "spectra/zarr.json;x", "%zz", "a" * 5000,
+    "../report.json",
+    "spectra/../../report.json",
+    "%2e%2e/report.json",
+    "spectra/%2e%2e/%2e%2e/report.json",
+    "spectra%2Fzarr.json",
+    "spectra%2fc%2f0%2f0",
+    "..%5creport.json",
+    "..\\report.json",
+    "/etc/passwd",
+    "/spectra/zarr.json",
+    "//spectra/zarr.json",
+    "./zarr.json",
+    "spectra//zarr.json",
+    "spectra/./zarr.json",
+    "spectra",
+    "spectra/",
+    "spectra/c",
+    "",
+    "zarr.json/",
+    "zarr.json%00",
+    "spectra/zarr.json%00.png",
+    "labels",
+    "labels/",
+    "labels/zarr.json",
+    "labels/../xyz/zarr.json",
+    "labels/tissue/zarr.json",
+    ".zgroup",
+    "spectra/.zarray",
+    "report.json",
+    "mesh.ply",
+    "c/0",
+    "spectra/c/0/0/0",
+    "spectra/c/4/0",
+    "spectra/zarr.json;x",
+    "%zz",
+    "a" * 5000,
     "spectra/c/" + "0/" * 200,
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize("key", HOSTILE)

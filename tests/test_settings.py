@@ -117,8 +117,15 @@ def test_variables_with_the_prefix_that_are_no_settings_are_let_be(monkeypatch: 
 
 
 def test_variables_of_backends_are_let_be_where_they_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
-    right = {"DEVICE": "cpu", "GRAPH": "swin-5", "SIZE_PX": "224", "SUBSAMPLE": "4", "SCHEDULE": "50,50",
-             "CONFIDENCE": "2", "BATCH": "4"}  # fmt: skip
+    right = {
+        "DEVICE": "cpu",
+        "GRAPH": "swin-5",
+        "SIZE_PX": "224",
+        "SUBSAMPLE": "4",
+        "SCHEDULE": "50,50",
+        "CONFIDENCE": "2",
+        "BATCH": "4",
+    }
     for name in BACKEND_VARIABLES:
         monkeypatch.setenv(name, right.get(re.sub(r"SPECIMAP_(MAST3R|DA3|DENSE)_", "", name), "/x"))
     assert load_settings().port == 8765

@@ -39,14 +39,26 @@ def outcome(level: float, *, truth: bool = True) -> Outcome:
     """Made-up figures."""
     return Outcome(
         figures=Figures(
-            photos_given=20, photos_used=20, corner_2d_mm=Spread(mean=level / 10, std=level / 30, n=16),
-            corner_3d_mm=Quartiles(median=level, q1=level / 2, q3=level * 2, n=16), leave_one_marker_out_mm=level / 5,
-            seconds=12.5, warnings=[],
-            truth=AgainstTruth(median_mm=level * 3, p95_mm=level * 9, coverage=0.99, scale=-0.001, within_1_sigma=0.7,
-                               within_2_sigma=0.95) if truth else None,
+            photos_given=20,
+            photos_used=20,
+            corner_2d_mm=Spread(mean=level / 10, std=level / 30, n=16),
+            corner_3d_mm=Quartiles(median=level, q1=level / 2, q3=level * 2, n=16),
+            leave_one_marker_out_mm=level / 5,
+            seconds=12.5,
+            warnings=[],
+            truth=AgainstTruth(
+                median_mm=level * 3,
+                p95_mm=level * 9,
+                coverage=0.99,
+                scale=-0.001,
+                within_1_sigma=0.7,
+                within_2_sigma=0.95,
+            )
+            if truth
+            else None,
         ),
         refusal=None,
-    )  # fmt: skip
+    )
 
 
 REFUSED = Outcome(figures=None, refusal=Refusal(code="too_few_photos", message="5 usable photos of 5."))
@@ -105,8 +117,10 @@ PROGRAM = (
 def test_ctrl_c_ends_a_study_in_order(small: OnDisk, tmp_path: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, "study", "subsampling", str(small.folder), "--out", str(tmp_path), "--json"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     assert process.stdout is not None
     for line in process.stdout:
         if json.loads(line)["share"] > 0:
@@ -202,9 +216,15 @@ def test_a_study_is_not_mixed_with_another(small: OnDisk, tmp_path: Path, ran: l
 
 def made_up(*rows: Row, has_truth: bool = True) -> Study:
     return Study(
-        specimap_version="0", acquisition="SP <1>", key="k", photos=20, has_truth=has_truth, method="camera",
-        adjustment="rigid", rows=list(rows),
-    )  # fmt: skip
+        specimap_version="0",
+        acquisition="SP <1>",
+        key="k",
+        photos=20,
+        has_truth=has_truth,
+        method="camera",
+        adjustment="rigid",
+        rows=list(rows),
+    )
 
 
 def test_the_page_needs_nothing_else(tmp_path: Path) -> None:
@@ -242,6 +262,13 @@ def test_every_run_is_a_line_of_the_table() -> None:
     table = study_table(rows)
     assert all(len(line) == len(STUDY_HEADINGS) for line in table.rows)
     assert table.rows[0] == (
-        "90 %", "2", "20 of 18", "0.002 ± 0.001", "0.020 (0.010-0.040)", "0.060, 0.18", "99.0 %", "12.5",
-    )  # fmt: skip
+        "90 %",
+        "2",
+        "20 of 18",
+        "0.002 ± 0.001",
+        "0.020 (0.010-0.040)",
+        "0.060, 0.18",
+        "99.0 %",
+        "12.5",
+    )
     assert table.rows[1][:4] == ("20 %", "1", "0 of 4", "too_few_photos")

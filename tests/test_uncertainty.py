@@ -176,9 +176,9 @@ def test_a_bend_makes_a_mesh_less_sure(after: Refined) -> None:
     dome = np.stack([x, y, np.sqrt(radius**2 - x**2 - y**2)], -1).astype(np.float32)
     flat = np.stack([x, y, np.zeros_like(x)], -1).astype(np.float32)
     first = (31 * np.arange(30)[:, None] + np.arange(30)).ravel()
-    triangles = np.concatenate([
-        np.stack([first, first + 1, first + 31], -1), np.stack([first + 1, first + 32, first + 31], -1)
-    ]).astype(np.int32)  # fmt: skip
+    triangles = np.concatenate(
+        [np.stack([first, first + 1, first + 31], -1), np.stack([first + 1, first + 32, first + 31], -1)]
+    ).astype(np.int32)
     grey = np.zeros((len(x), 3), np.uint8)
     normals = (dome / np.linalg.norm(dome, axis=1, keepdims=True)).astype(np.float32)
     round_mm = bend_mm(Mesh(dome, triangles, normals, grey))

@@ -189,9 +189,12 @@ def rows_of(defect: str, seed: int, result: Outcome) -> list[Row]:
 
 def test_tables_pool_seeds_and_show_the_worst(tmp_path: Path) -> None:
     rows = [
-        *rows_of("none", 1, outcome(0.02)), *rows_of("none", 2, outcome(0.03)), *rows_of("none", 3, outcome(0.07)),
-        *rows_of("blur", 1, REFUSED), *rows_of(MOVED, 1, outcome(0.5)),
-    ]  # fmt: skip
+        *rows_of("none", 1, outcome(0.02)),
+        *rows_of("none", 2, outcome(0.03)),
+        *rows_of("none", 3, outcome(0.07)),
+        *rows_of("blur", 1, REFUSED),
+        *rows_of(MOVED, 1, outcome(0.5)),
+    ]
     validation = Validation(specimap_version="0", quick=False, rows=rows)
     by_case, by_form = validation_tables(validation)
     assert all(len(line) == len(VALIDATION_HEADINGS) for table in (by_case, by_form) for line in table.rows)

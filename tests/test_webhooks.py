@@ -118,8 +118,10 @@ def test_delivery_is_signed_and_carries_the_job(
     assert headers["content-type"] == "application/json"
     told = json.loads(body)
     assert (told["event"], told["job"]["state"], told["job"]["seconds"]) == (
-        "job.succeeded", "succeeded", {"adjust": 1.5},
-    )  # fmt: skip
+        "job.succeeded",
+        "succeeded",
+        {"adjust": 1.5},
+    )
     assert before <= datetime.datetime.fromisoformat(told["delivered_at"]) <= utc_now()
     assert SECRET not in body.decode()
     assert "webhook" not in told["job"]
@@ -260,5 +262,6 @@ def test_host_is_checked_when_the_job_is_made(tmp_path: Path, receiver: Receiver
         assert deliver_due(service.database, service.settings, client) == 2
     told = [json.loads(body) for _, body in receiver.got]
     assert {(t["event"], t["job"]["id"]) for t in told} == {
-        ("job.cancelled", job.json()["id"]), ("job.cancelled", again),
-    }  # fmt: skip
+        ("job.cancelled", job.json()["id"]),
+        ("job.cancelled", again),
+    }

@@ -166,5 +166,3 @@ def test_two_apis_and_three_workers_on_postgresql_and_s3(
                             yard.storage.fetch(f"{row.prefix}/cloud.zarr", local)
                         expected = Cloud.open(local).spectra([17])[0]
                         assert point["spectrum"] == pytest.approx(expected.tolist(), abs=1e-4)
-
-

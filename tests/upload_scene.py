@@ -119,9 +119,11 @@ def process_serving(folder: Path, **given: Any) -> Iterator[tuple[subprocess.Pop
     migrate(database)
     database.close()
     process = subprocess.Popen(
-        [sys.executable, "-c", SERVER, json.dumps(settings)], stdout=subprocess.PIPE, text=True,
+        [sys.executable, "-c", SERVER, json.dumps(settings)],
+        stdout=subprocess.PIPE,
+        text=True,
         env={k: v for k, v in os.environ.items() if not k.startswith("SPECIMAP_")},
-    )  # fmt: skip
+    )
     try:
         assert process.stdout is not None
         port = int(process.stdout.readline())

@@ -94,9 +94,10 @@ def tiff(folder: Path, stored: Values, no_data: float | None, gains: Floats | No
     tags: list[tuple[int, str, int, str, bool]] = []
     items = [
         f'<Item name="{role.upper()}" sample="{i}" role="{role}">{float(value)!r}</Item>'
-        for role, values in (("scale", gains), ("offset", offsets)) if values is not None
+        for role, values in (("scale", gains), ("offset", offsets))
+        if values is not None
         for i, value in enumerate(np.broadcast_to(values, stored.shape[2]))
-    ]  # fmt: skip
+    ]
     if items:
         tags.append((42112, "s", 0, f"<GDALMetadata>{''.join(items)}</GDALMetadata>", False))
     if no_data is not None:
@@ -109,6 +110,12 @@ def tiff(folder: Path, stored: Values, no_data: float | None, gains: Floats | No
 
 Writer = Callable[[Path, Values, float | None, Floats | None, Floats | None], Path]
 WRITERS: dict[str, Writer] = {
-    "envi": envi, "hdf5": hdf5, "netcdf4": netcdf4, "netcdf3": netcdf3, "matlab5": matlab5, "matlab73": matlab73,
-    "npz": npz, "tiff": tiff,
-}  # fmt: skip
+    "envi": envi,
+    "hdf5": hdf5,
+    "netcdf4": netcdf4,
+    "netcdf3": netcdf3,
+    "matlab5": matlab5,
+    "matlab73": matlab73,
+    "npz": npz,
+    "tiff": tiff,
+}

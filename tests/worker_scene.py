@@ -79,11 +79,19 @@ class Shop:
         with self.database.session() as session:
             session.add(
                 StoredFile(
-                    id=name, acquisition_id=acquisition, role=role, label=label, name=path.name, size=len(data),
-                    sha256=hashlib.sha256(data).hexdigest(), storage_key=key, state="accepted", judgement={},
+                    id=name,
+                    acquisition_id=acquisition,
+                    role=role,
+                    label=label,
+                    name=path.name,
+                    size=len(data),
+                    sha256=hashlib.sha256(data).hexdigest(),
+                    storage_key=key,
+                    state="accepted",
+                    judgement={},
                     created_by="key_test",
                 )
-            )  # fmt: skip
+            )
 
     def submit(self, acquisition: str, priority: int = 5, **settings: object) -> str:
         """Put a job in the queue."""
@@ -91,10 +99,16 @@ class Shop:
         with self.database.session() as session:
             session.add(
                 Job(
-                    id=job_id, acquisition_id=acquisition, settings=settings, priority=priority, state="queued",
-                    request_hash="", correlation_id="test", created_by="key_test",
+                    id=job_id,
+                    acquisition_id=acquisition,
+                    settings=settings,
+                    priority=priority,
+                    state="queued",
+                    request_hash="",
+                    correlation_id="test",
+                    created_by="key_test",
                 )
-            )  # fmt: skip
+            )
             session.flush()
             enqueue(client, session.connection(), JOBS, RUN_JOB, job_id, priority)
         return job_id
@@ -210,10 +224,14 @@ class Shop:
 def shop(folder: Path, **given: object) -> Iterator[Shop]:
     """Open one; ``given`` are settings."""
     values = {
-        "data_dir": folder, "log_level": "warning", "heartbeat_seconds": 0.6, "lease_seconds": 3.0,
+        "data_dir": folder,
+        "log_level": "warning",
+        "heartbeat_seconds": 0.6,
+        "lease_seconds": 3.0,
         # Its stages are held by files that lie where a confined process reaches nothing.
-        "sandbox": "off", **given,
-    }  # fmt: skip
+        "sandbox": "off",
+        **given,
+    }
     environment = {f"SPECIMAP_{name.upper()}": str(value) for name, value in values.items()}
     settings = load_settings(**values)
     database = Database.open(settings.database)

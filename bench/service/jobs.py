@@ -61,10 +61,14 @@ def sheet_jobs(figures: dict[str, Any]) -> list[Sheet]:
         cells = (_median(runs, name) for name in ("heard_s", "wait_s", "stages_s", "overhead_s"))
         sheet.rows.append(
             (
-                NAMES[kind], str(len(runs)), *(f"{value:.2f}" for value in cells), f"{worst:.2f}",
-                f"< {OVERHEAD_TARGET_S:.0f} s", reached(worst, OVERHEAD_TARGET_S, least=False),
+                NAMES[kind],
+                str(len(runs)),
+                *(f"{value:.2f}" for value in cells),
+                f"{worst:.2f}",
+                f"< {OVERHEAD_TARGET_S:.0f} s",
+                reached(worst, OVERHEAD_TARGET_S, least=False),
             )
-        )  # fmt: skip
+        )
     uploaded = _median(figures["runs"]["job"], "upload_s")
     sheet.notes.append(
         "Waited: from submission to the worker's start. Beside them: from there to the end, less the stages that ran. "

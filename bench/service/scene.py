@@ -74,25 +74,44 @@ def put_result(served: Served, work: Path) -> Result:
     with database.session() as session:
         session.add(
             Acquisition(
-                id=acquisition_id, specimen_id="bench", dictionary="DICT_4X4_50", edge_mm=6.8, notes="",
+                id=acquisition_id,
+                specimen_id="bench",
+                dictionary="DICT_4X4_50",
+                edge_mm=6.8,
+                notes="",
                 created_by="key_bench",
             )
-        )  # fmt: skip
+        )
         session.flush()
         session.add(
             Job(
-                id=job_id, acquisition_id=acquisition_id, settings={}, priority=5, state="succeeded", starts=1,
-                request_hash="", correlation_id="bench", seconds={}, started_at=now, finished_at=now,
+                id=job_id,
+                acquisition_id=acquisition_id,
+                settings={},
+                priority=5,
+                state="succeeded",
+                starts=1,
+                request_hash="",
+                correlation_id="bench",
+                seconds={},
+                started_at=now,
+                finished_at=now,
                 created_by="key_bench",
             )
-        )  # fmt: skip
+        )
         session.flush()
         session.add(
             CloudRow(
-                id=cloud_id, job_id=job_id, acquisition_id=acquisition_id, prefix=prefix, points=cloud.n_points,
-                bands=cloud.bands, size=folder_bytes(group), report={},
+                id=cloud_id,
+                job_id=job_id,
+                acquisition_id=acquisition_id,
+                prefix=prefix,
+                points=cloud.n_points,
+                bands=cloud.bands,
+                size=folder_bytes(group),
+                report={},
             )
-        )  # fmt: skip
+        )
     database.close()
     os.sync()
     return Result(cloud_id, group)

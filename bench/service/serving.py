@@ -87,8 +87,11 @@ def serving(folder: Path, *, worker: bool = False) -> Iterator[Served]:
     with open(log, "wb") as errors:
         process = subprocess.Popen(
             [*COMMAND, "--worker" if worker else "--no-worker"],
-            stdout=subprocess.PIPE, stderr=errors, text=True, env={**environment, "PYTHONUNBUFFERED": "1"},
-        )  # fmt: skip
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+            env={**environment, "PYTHONUNBUFFERED": "1"},
+        )
     # The start fails by the end of its output; a start that hangs is ended, which ends its output.
     hung = threading.Timer(START_SECONDS, process.kill)
     hung.start()

@@ -58,9 +58,11 @@ def sheet_shard(figures: dict[str, Any]) -> list[Sheet]:
             other = max(run["mb_per_s"] for run in places["nginx"])
             share = best["mb_per_s"] / other
             row += [
-                f"{other:.0f}", f"{100 * share:.0f} %", f">= {100 * SHARE_TARGET:.0f} %",
+                f"{other:.0f}",
+                f"{100 * share:.0f} %",
+                f">= {100 * SHARE_TARGET:.0f} %",
                 reached(share, SHARE_TARGET, least=True),
-            ]  # fmt: skip
+            ]
         else:
             row += [NONE] * 4
         sheet.rows.append((*row, f"{best['p50_ms']:.2f}", f"{best['cpu_s_per_gb']:.2f}"))

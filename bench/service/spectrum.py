@@ -80,10 +80,15 @@ def sheet_spectrum(figures: dict[str, Any]) -> list[Sheet]:
             best = max(runs, key=lambda run: run["per_second"])
             sheet.rows.append(
                 (
-                    NAMES[name], str(figures["bytes"][name]), clients, f"{best['p50_ms']:.2f}", f"{best['p99_ms']:.2f}",
-                    f"{best['per_second']:.0f}", f"{best['cpu_ms']:.2f}" if "cpu_ms" in best else NONE,
+                    NAMES[name],
+                    str(figures["bytes"][name]),
+                    clients,
+                    f"{best['p50_ms']:.2f}",
+                    f"{best['p99_ms']:.2f}",
+                    f"{best['per_second']:.0f}",
+                    f"{best['cpu_ms']:.2f}" if "cpu_ms" in best else NONE,
                 )
-            )  # fmt: skip
+            )
     sheet.notes.append("The client (one process, raw sockets) runs on the same cores; CPU is the API process's alone.")
     if figures["nginx"] is None:
         sheet.notes.append(NO_NGINX)

@@ -63,18 +63,26 @@ def sheet_upload(figures: dict[str, Any]) -> list[Sheet]:
 
         speed.rows.append(
             (
-                f"{size / 1e9:.2f}", rate("up_s"), rate("nginx_up_s"), f"{size / 1e6 / cube['sha256_s']:.0f}",
-                f"{min(run['up_cpu_s'] for run in runs) * 1e9 / size:.2f}", rate("down_s"), rate("nginx_down_s"),
+                f"{size / 1e9:.2f}",
+                rate("up_s"),
+                rate("nginx_up_s"),
+                f"{size / 1e6 / cube['sha256_s']:.0f}",
+                f"{min(run['up_cpu_s'] for run in runs) * 1e9 / size:.2f}",
+                rate("down_s"),
+                rate("nginx_down_s"),
                 f"{min(run['down_cpu_s'] for run in runs) * 1e9 / size:.2f}",
             )
-        )  # fmt: skip
+        )
         worst = max(runs, key=_growth)
         memory.rows.append(
             (
-                f"{size / 1e9:.2f}", *(f"{value:.0f}" for value in worst["memory_mb"].values()),
-                f"{_growth(worst):.0f}", f"<= {FLAT_MB:.0f}", reached(_growth(worst), FLAT_MB, least=False),
+                f"{size / 1e9:.2f}",
+                *(f"{value:.0f}" for value in worst["memory_mb"].values()),
+                f"{_growth(worst):.0f}",
+                f"<= {FLAT_MB:.0f}",
+                reached(_growth(worst), FLAT_MB, least=False),
             )
-        )  # fmt: skip
+        )
     speed.notes.append(
         "Up, the client hashes each piece and the whole file, the service each piece on arrival and the whole file at "
         "its end, flushes it to the disk and judges it, all within the time; nginx writes it and no more."

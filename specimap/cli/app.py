@@ -114,9 +114,16 @@ def run(
         from specimap.core.pipeline.settings import settings_from
 
         settings = settings_from(
-            edge_mm=edge_mm, dictionary=dictionary, method=method.value, adjustment=adjustment.value, r_pc=r_pc,
-            r_reg=r_reg, backend=backend.value, features=features.value, working_px=working_px,
-        )  # fmt: skip
+            edge_mm=edge_mm,
+            dictionary=dictionary,
+            method=method.value,
+            adjustment=adjustment.value,
+            r_pc=r_pc,
+            r_reg=r_reg,
+            backend=backend.value,
+            features=features.value,
+            working_px=working_px,
+        )
         with listener:
             report = run_pipeline(
                 Inputs(photos, cube, white, dark),

@@ -107,14 +107,19 @@ def _service(folder: Path) -> Iterator[tuple[str, str]]:
     folder.mkdir(parents=True, mode=0o700)
     environment = {
         **{name: value for name, value in os.environ.items() if not name.startswith("SPECIMAP_")},
-        "SPECIMAP_DATA_DIR": str(folder.absolute()), "SPECIMAP_PORT": "0", "SPECIMAP_MIN_FREE_BYTES": "0",
+        "SPECIMAP_DATA_DIR": str(folder.absolute()),
+        "SPECIMAP_PORT": "0",
+        "SPECIMAP_MIN_FREE_BYTES": "0",
         "PYTHONUNBUFFERED": "1",
-    }  # fmt: skip
+    }
     log = open(folder / "service.log", "wb")  # noqa: SIM115 - outlives this block's first lines
     process = subprocess.Popen(
         [sys.executable, "-c", "from specimap.cli import main; main()", "serve"],
-        env=environment, stdout=subprocess.PIPE, stderr=log, text=True,
-    )  # fmt: skip
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=log,
+        text=True,
+    )
     try:
         yield _told(process, folder / "service.log")
     finally:
@@ -145,7 +150,5 @@ def _told(process: subprocess.Popen[str], log: Path) -> tuple[str, str]:
     deadline = time.monotonic() + START_SECONDS
     while not complete.wait(0.1):
         if process.poll() is not None or time.monotonic() > deadline:
-            raise BackendUnavailableError(
-                "The service did not start.", advice=f"{log} says why.", log=str(log)
-            )
+            raise BackendUnavailableError("The service did not start.", advice=f"{log} says why.", log=str(log))
     return found["url"], found["key"]

@@ -58,9 +58,12 @@ def print_diagnosis(found: Diagnosis) -> None:
     for part in found.parts:
         default = ", default" if part.kind == "backend" and part.name == found.default else ""
         table.add_row(
-            part.kind, part.name + default, "[green]yes[/]" if part.usable else "[yellow]no[/]",
-            escape(", ".join(_with(part))), escape(part.licence),
-        )  # fmt: skip
+            part.kind,
+            part.name + default,
+            "[green]yes[/]" if part.usable else "[yellow]no[/]",
+            escape(", ".join(_with(part))),
+            escape(part.licence),
+        )
     console.print(table)
     for part in found.parts:
         for missing in part.missing:

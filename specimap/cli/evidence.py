@@ -53,9 +53,16 @@ def subsampling(
 
         wanted = _numbers(shares, "shares")
         settings = settings_from(
-            edge_mm=edge_mm, dictionary=dictionary, method="camera", adjustment="rigid", r_pc=0.5, r_reg=2.0,
-            backend="colmap", features="auto", working_px=1280,
-        )  # fmt: skip
+            edge_mm=edge_mm,
+            dictionary=dictionary,
+            method="camera",
+            adjustment="rigid",
+            r_pc=0.5,
+            r_reg=2.0,
+            backend="colmap",
+            features="auto",
+            working_px=1280,
+        )
         capture = find_capture(acquisition)
         check_drawing()
 
@@ -65,9 +72,15 @@ def subsampling(
 
         with listener:
             study = study_subsampling(
-                capture, out, settings, shares=wanted, seeds=seeds,
-                progress=lambda share: listener.progress("study", share), heard=heard, cancelled=stop_asked,
-            )  # fmt: skip
+                capture,
+                out,
+                settings,
+                shares=wanted,
+                seeds=seeds,
+                progress=lambda share: listener.progress("study", share),
+                heard=heard,
+                cancelled=stop_asked,
+            )
             written = publish_study(study, out)
         _finished(json_events, out, study.model_dump(mode="json"), [study_table(study.rows)], written)
 
@@ -106,9 +119,13 @@ def validate(
 
         with listener:
             validation = v.validate(
-                found, out, quick=quick, progress=lambda share: listener.progress("validate", share), heard=heard,
+                found,
+                out,
+                quick=quick,
+                progress=lambda share: listener.progress("validate", share),
+                heard=heard,
                 cancelled=stop_asked,
-            )  # fmt: skip
+            )
             written = publish_validation(validation, out)
         if update_docs is not None:
             put(update_docs, v.MARK, markdown(validation))

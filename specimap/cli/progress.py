@@ -56,9 +56,12 @@ class _Bars:
     def __init__(self) -> None:
         self._console = Console(stderr=True)
         self._progress = Progress(
-            TextColumn("{task.description:<16}"), BarColumn(), TextColumn("{task.percentage:>3.0f}%"),
-            TimeElapsedColumn(), console=self._console,
-        )  # fmt: skip
+            TextColumn("{task.description:<16}"),
+            BarColumn(),
+            TextColumn("{task.percentage:>3.0f}%"),
+            TimeElapsedColumn(),
+            console=self._console,
+        )
         self._tasks: dict[str, TaskID] = {}
 
     def __enter__(self) -> Self:
@@ -139,9 +142,12 @@ class UploadBar:
 
     def __init__(self) -> None:
         self._progress = Progress(
-            TextColumn("{task.description:<16}"), BarColumn(), DownloadColumn(), TimeElapsedColumn(),
+            TextColumn("{task.description:<16}"),
+            BarColumn(),
+            DownloadColumn(),
+            TimeElapsedColumn(),
             console=Console(stderr=True),
-        )  # fmt: skip
+        )
         self._task = self._progress.add_task("upload", total=None)
 
     def __enter__(self) -> Self:

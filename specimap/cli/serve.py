@@ -64,9 +64,17 @@ def serve(*, workers: bool, say: Callable[[str], None]) -> None:
                 say(key)
 
     config = uvicorn.Config(
-        app, log_config=None, access_log=False, ws="none", lifespan="on", proxy_headers=False, server_header=False,
-        timeout_graceful_shutdown=5, timeout_keep_alive=75, http=Connection,
-    )  # fmt: skip
+        app,
+        log_config=None,
+        access_log=False,
+        ws="none",
+        lifespan="on",
+        proxy_headers=False,
+        server_header=False,
+        timeout_graceful_shutdown=5,
+        timeout_keep_alive=75,
+        http=Connection,
+    )
     # The server raises the signal that stopped it once more at its end: the workers still have to be ended then.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: None)

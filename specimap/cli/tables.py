@@ -24,8 +24,9 @@ def print_report(report: Report) -> None:
     methods = report.methods.values()
     table.add_row(
         "2D corner error, mean ± sd",
-        *(f"{m.corner_2d_mm.mean:.3f} ± {m.corner_2d_mm.std:.3f}" for m in methods), PUBLISHED["2d"],
-    )  # fmt: skip
+        *(f"{m.corner_2d_mm.mean:.3f} ± {m.corner_2d_mm.std:.3f}" for m in methods),
+        PUBLISHED["2d"],
+    )
     table.add_row("3D corner error, median", *(f"{m.corner_3d_mm.median:.3f}" for m in methods), PUBLISHED["3d"])
     table.add_row("leave one marker out, median", *(_left_out(m.leave_one_marker_out_mm) for m in methods), "-")
     console.print(table)

@@ -125,10 +125,16 @@ def read_photo(path: Path, settings: AcquisitionSettings) -> Photo:
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
     equivalent = decoded.stated.focal_35mm
     return Photo(
-        name_as_text(path), np.ascontiguousarray(image), decoded.full_size,
+        name_as_text(path),
+        np.ascontiguousarray(image),
+        decoded.full_size,
         equivalent / FULL_FRAME_DIAGONAL_MM * math.hypot(*size) if equivalent else None,
-        decoded.stated.subject_mm, sharpness_of(image), decoded.digest, decoded.quarter_turns, decoded.stated,
-    )  # fmt: skip
+        decoded.stated.subject_mm,
+        sharpness_of(image),
+        decoded.digest,
+        decoded.quarter_turns,
+        decoded.stated,
+    )
 
 
 def sharpness_of(image: NDArray[np.uint8]) -> float:
@@ -197,15 +203,17 @@ def _too_few(
     first = unreadable[:1] or refused[:1]
     beside = photo_folder(paths[0].parent).remarks() if paths else []
     return leaf(
-        " ".join([
-            f"{len(photos)} usable photos of {len(paths)}; at least {least} are needed.",
-            *(f"{r.name}: {r.reason}" for r in first),
-            *(sentence for _, sentence in beside),
-        ]),
+        " ".join(
+            [
+                f"{len(photos)} usable photos of {len(paths)}; at least {least} are needed.",
+                *(f"{r.name}: {r.reason}" for r in first),
+                *(sentence for _, sentence in beside),
+            ]
+        ),
         advice=advice,
         usable=len(photos),
         refused={r.name: r.reason for r in refused},
-    )  # fmt: skip
+    )
 
 
 def of_one_camera(photos: list[Photo]) -> tuple[list[Photo], list[Refusal]]:
@@ -214,9 +222,7 @@ def of_one_camera(photos: list[Photo]) -> tuple[list[Photo], list[Refusal]]:
         return [], []
     shapes = Counter(p.full_size for p in photos)
     # A camera's pictures count together, however it was held.
-    usual = max(
-        shapes, key=lambda s: (shapes[s] + shapes[s[::-1]] * (s[0] != s[1]), shapes[s], s[0] * s[1])
-    )
+    usual = max(shapes, key=lambda s: (shapes[s] + shapes[s[::-1]] * (s[0] != s[1]), shapes[s], s[0] * s[1]))
     of_usual = [p for p in photos if p.full_size in (usual, usual[::-1])]
     camera = _usual_camera(of_usual)
     turns = Counter(p.quarter_turns for p in photos if p.full_size == usual).most_common(1)[0][0]

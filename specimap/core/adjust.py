@@ -141,15 +141,21 @@ def adjust(
     # Photos without a marker keep their place relative to the corners.
     _, R, t = fit_similarity(factor * start.reshape(-1, 3), final.apply(solved.corners).reshape(-1, 3))
     follow = Pose(R, t).inverse()
-    all_poses = tuple(
-        refined.get(k, _scaled(pose, factor) @ follow) for k, pose in enumerate(start_poses)
-    )
+    all_poses = tuple(refined.get(k, _scaled(pose, factor) @ follow) for k, pose in enumerate(start_poses))
     corners = final.apply(solved.corners)
     covariance = corner_covariance(solved, info)
     return Adjusted(
-        solved.lens, all_poses, ids, corners, _in_frame(covariance, final.R), scale, before, info.rms_after_px,
-        info.iterations, len(inner.photo),
-    )  # fmt: skip
+        solved.lens,
+        all_poses,
+        ids,
+        corners,
+        _in_frame(covariance, final.R),
+        scale,
+        before,
+        info.rms_after_px,
+        info.iterations,
+        len(inner.photo),
+    )
 
 
 def _scaled(pose: Pose, factor: float) -> Pose:
@@ -161,4 +167,3 @@ def _in_frame(covariance: Floats, R: Floats) -> Floats:
     n = len(covariance) // 3
     blocks = covariance.reshape(n, 3, n, 3)
     return np.asarray(np.einsum("ij,ajbk,lk->aibl", R, blocks, R).reshape(3 * n, 3 * n))
-

@@ -145,9 +145,7 @@ def patch_scores(
     order = np.argsort(views[row, column], kind="stable")
     row, view = row[order], views[row, column][order]
     count = np.bincount(row, minlength=len(points))
-    sum_of_row = csr_array(
-        (np.ones(len(row), np.float32), (row, np.arange(len(row)))), shape=(len(points), len(row))
-    )
+    sum_of_row = csr_array((np.ones(len(row), np.float32), (row, np.arange(len(row)))), shape=(len(points), len(row)))
     first = np.searchsorted(view, np.arange(len(poses) + 1))
     R = np.stack([p.R for p in poses])[view]
     helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])

@@ -28,9 +28,9 @@ def corner_covariance(scene: MarkerScene, info: SolveInfo) -> Floats:
                 B[row : row + 3, 6 * q : 6 * q + 6] = np.hstack([-skew(arm[c]), np.eye(3)])
         block = B @ block @ B.T
     points = scene.corners.reshape(-1, 3)
-    motions = np.concatenate(
-        [np.tile(np.eye(3), (len(points), 1, 1)), -skew(points - points.mean(0))], -1
-    ).reshape(-1, 6)
+    motions = np.concatenate([np.tile(np.eye(3), (len(points), 1, 1)), -skew(points - points.mean(0))], -1).reshape(
+        -1, 6
+    )
     q_basis, _ = np.linalg.qr(motions)
     keep = np.eye(12 * Q) - q_basis @ q_basis.T
     return np.asarray(keep @ block @ keep)

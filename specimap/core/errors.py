@@ -32,9 +32,7 @@ class SpecimapError(Exception):
         return {"code": self.code, "message": self.message, "advice": self.advice, "details": self.details}
 
 
-def _rebuild(
-    leaf: type[SpecimapError], message: str, advice: str, details: dict[str, object]
-) -> SpecimapError:
+def _rebuild(leaf: type[SpecimapError], message: str, advice: str, details: dict[str, object]) -> SpecimapError:
     return leaf(message, advice=advice, **details)
 
 

@@ -31,10 +31,17 @@ SHARPENED_PX = 1.5
 TONE_PHOTOS = 8
 """Photos whose markers tell the tone of all."""
 DICTIONARY_TRIALS = (
-    "DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL",
-    "DICT_ARUCO_MIP_36h12", "DICT_APRILTAG_16h5", "DICT_APRILTAG_25h9", "DICT_APRILTAG_36h10",
+    "DICT_4X4_1000",
+    "DICT_5X5_1000",
+    "DICT_6X6_1000",
+    "DICT_7X7_1000",
+    "DICT_ARUCO_ORIGINAL",
+    "DICT_ARUCO_MIP_36h12",
+    "DICT_APRILTAG_16h5",
+    "DICT_APRILTAG_25h9",
+    "DICT_APRILTAG_36h10",
     "DICT_APRILTAG_36h11",
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
@@ -166,8 +173,7 @@ def _collect(
             continue
         centre = corners.mean(0)
         known = any(
-            known_id == marker_id and np.linalg.norm(other.mean(0) - centre) < edges.mean()
-            for known_id, other in found
+            known_id == marker_id and np.linalg.norm(other.mean(0) - centre) < edges.mean() for known_id, other in found
         )
         if not known:
             found.append((int(marker_id), corners))

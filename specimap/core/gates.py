@@ -57,8 +57,9 @@ def outlying_photos(report: Report) -> list[Outlying]:
     limit = max(OUTLYING_PX * _scale(photos), OUTLYING_MEDIANS * float(np.median(rms)))
     found = [
         Outlying(p.name, float(r), p.marker_ids[int(s.argmax())], float(np.sqrt(s.max())))
-        for p, r, s in zip(photos, rms, squares, strict=True) if r > limit
-    ]  # fmt: skip
+        for p, r, s in zip(photos, rms, squares, strict=True)
+        if r > limit
+    ]
     return sorted(found, key=lambda o: -o.px)
 
 
@@ -84,18 +85,22 @@ def _remarks(report: Report) -> list[tuple[str, str]]:
     remarks: list[tuple[str, str]] = []
     coverage, rms, outlying = report.coverage, report.reprojection_px.after, outlying_photos(report)
     if not coverage.between_markers > LEAST_COVERAGE:
-        remarks.append((
-            "coverage_low",
-            f"Only {100 * coverage.between_markers:.1f} % of the cube's pixels between the markers have a point.",
-        ))  # fmt: skip
+        remarks.append(
+            (
+                "coverage_low",
+                f"Only {100 * coverage.between_markers:.1f} % of the cube's pixels between the markers have a point.",
+            )
+        )
     if not coverage.specimen_points:
         remarks.append(("specimen_not_found", "Nothing rises above the markers' plane as a specimen does."))
     if not rms <= corner_limit_px(report):
-        remarks.append((
-            "corners_scatter",
-            f"The markers' corners in the photos lie {rms:.2f} px (RMS) from where all photos together put them; "
-            f"{corner_limit_px(report):.1f} px are the most to be expected.",
-        ))  # fmt: skip
+        remarks.append(
+            (
+                "corners_scatter",
+                f"The markers' corners in the photos lie {rms:.2f} px (RMS) from where all photos together put them; "
+                f"{corner_limit_px(report):.1f} px are the most to be expected.",
+            )
+        )
     if outlying:
         named = "; ".join(
             f"{o.name} {o.px:.1f} px, marker {o.marker} {o.marker_px:.1f} px" for o in outlying[:MOST_NAMED]
@@ -104,10 +109,12 @@ def _remarks(report: Report) -> list[tuple[str, str]]:
         remarks.append(("photo_outlying", f"In some photos the markers' corners lie off: {named}{more}."))
     cube = report.cube_camera.reprojection_rms_px
     if not cube <= MOST_CUBE_RMS_PX:
-        remarks.append((
-            "cube_corners_scatter",
-            f"The markers' corners in the cube lie {cube:.2f} px (RMS) from where its solved camera puts them.",
-        ))  # fmt: skip
+        remarks.append(
+            (
+                "cube_corners_scatter",
+                f"The markers' corners in the cube lie {cube:.2f} px (RMS) from where its solved camera puts them.",
+            )
+        )
     return remarks
 
 

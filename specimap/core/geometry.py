@@ -46,9 +46,7 @@ class Intrinsics:
     aspect: float = 1.0
 
     @staticmethod
-    def centred(
-        width: int, height: int, focal_px: float, k1: float = 0.0, k2: float = 0.0
-    ) -> Intrinsics:
+    def centred(width: int, height: int, focal_px: float, k1: float = 0.0, k2: float = 0.0) -> Intrinsics:
         """Intrinsics whose principal point is the image's centre."""
         return Intrinsics(width, height, focal_px, (width - 1) / 2, (height - 1) / 2, k1, k2)
 
@@ -185,14 +183,10 @@ def skew(v: Floats) -> Floats:
     """Vectors (..., 3) to their cross product matrices (..., 3, 3)."""
     zero = np.zeros_like(v[..., 0])
     x, y, z = v[..., 0], v[..., 1], v[..., 2]
-    return np.stack(
-        [np.stack([zero, -z, y], -1), np.stack([z, zero, -x], -1), np.stack([-y, x, zero], -1)], -2
-    )
+    return np.stack([np.stack([zero, -z, y], -1), np.stack([z, zero, -x], -1), np.stack([-y, x, zero], -1)], -2)
 
 
-def fit_similarity(
-    source: Floats, target: Floats, *, with_scale: bool = False
-) -> tuple[float, Floats, Floats]:
+def fit_similarity(source: Floats, target: Floats, *, with_scale: bool = False) -> tuple[float, Floats, Floats]:
     """Scale, R (3, 3), t (3,) with ``target ~ scale * R source + t`` in the least squares (Umeyama 1991).
 
     ``source`` and ``target``: (N, 3), N >= 3, not collinear. The scale is 1 unless ``with_scale``.

@@ -40,9 +40,13 @@ def json_text(
 ) -> str:
     """``value`` as JSON that every parser reads; see :func:`json_ready`."""
     return json.dumps(
-        json_ready(value), allow_nan=False, indent=indent, sort_keys=sort_keys, separators=separators,
+        json_ready(value),
+        allow_nan=False,
+        indent=indent,
+        sort_keys=sort_keys,
+        separators=separators,
         ensure_ascii=ensure_ascii,
-    )  # fmt: skip
+    )
 
 
 def json_log_line(event: Mapping[str, Any], **_: object) -> str:

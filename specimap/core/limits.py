@@ -18,8 +18,9 @@ def as_if_in_mm(edge: float, low: float = USUAL_EDGE_MM[0], high: float = USUAL_
     """What an edge would be in mm, ``low`` to ``high``, were it given in another unit: sentences' parts."""
     return [
         f"{edge * factor:.4g} if it is in {unit}"
-        for unit, factor in OTHER_UNITS.items() if low <= edge * factor <= high
-    ]  # fmt: skip
+        for unit, factor in OTHER_UNITS.items()
+        if low <= edge * factor <= high
+    ]
 
 
 def advice_on(name: str, value: float) -> str:

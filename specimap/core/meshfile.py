@@ -124,7 +124,7 @@ def _write_glb(file: BinaryIO, mesh: Mesh) -> None:
         (mesh.normals.astype("<f4"), 5126, "VEC3", 34962),
         (colours, 5123, "VEC4", 34962),
         (mesh.triangles.astype("<u4").ravel(), 5125, "SCALAR", 34963),
-    ]  # fmt: skip
+    ]
     views, accessors, at = [], [], 0
     for i, (values, component, kind, target) in enumerate(parts):
         views.append({"buffer": 0, "byteOffset": at, "byteLength": values.nbytes, "target": target})

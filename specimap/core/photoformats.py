@@ -26,10 +26,29 @@ FORMATS = {
 """By Pillow's name. Whatever a file is called, Pillow's other parsers (PostScript among them) do not get to see it."""
 PHOTO_SUFFIXES = frozenset(suffix for known in FORMATS.values() for suffix in known.suffixes)
 MEDIA_TYPES = {known.suffix: known.media_type for known in FORMATS.values()}
-RAW_SUFFIXES = frozenset({
-    ".dng", ".nef", ".nrw", ".cr2", ".cr3", ".crw", ".arw", ".srf", ".sr2", ".orf", ".rw2", ".raf", ".pef", ".srw",
-    ".x3f", ".3fr", ".erf", ".kdc", ".mrw",
-})  # fmt: skip
+RAW_SUFFIXES = frozenset(
+    {
+        ".dng",
+        ".nef",
+        ".nrw",
+        ".cr2",
+        ".cr3",
+        ".crw",
+        ".arw",
+        ".srf",
+        ".sr2",
+        ".orf",
+        ".rw2",
+        ".raf",
+        ".pef",
+        ".srw",
+        ".x3f",
+        ".3fr",
+        ".erf",
+        ".kdc",
+        ".mrw",
+    }
+)
 """Sensor readings: colours, lens and noise are the software's that develops them, so no picture can be taken for
 granted."""
 NAMES = "JPEG, HEIC, PNG, TIFF, WebP, AVIF or BMP"

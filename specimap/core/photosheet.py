@@ -63,9 +63,7 @@ def contact_sheet(images: Sequence[Bytes]) -> bytes:
     layout = SheetLayout.of(len(images), width, height)
     sheet = np.full((layout.rows * layout.tile_height_px, layout.columns * layout.tile_width_px, 3), 255, np.uint8)
     for k, image in enumerate(images):
-        tile = cv2.resize(
-            image, (layout.tile_width_px, layout.tile_height_px), interpolation=cv2.INTER_AREA
-        )
+        tile = cv2.resize(image, (layout.tile_width_px, layout.tile_height_px), interpolation=cv2.INTER_AREA)
         sheet[layout.place(k)] = tile[..., None] if tile.ndim == 2 else tile
     done, jpeg = cv2.imencode(".jpg", sheet[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     if not done:

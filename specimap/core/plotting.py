@@ -143,10 +143,26 @@ def scale_bar(ax: Axes, px_per_mm: float, width_px: float, *, colour: str = INK)
 
     halo = [patheffects.withStroke(linewidth=3.5, foreground="white")]
     share = length * px_per_mm / width_px
-    ax.plot([0.03, 0.03 + share], [0.04, 0.04], transform=ax.transAxes, color=colour, linewidth=2.2,
-            solid_capstyle="butt", path_effects=halo)  # fmt: skip
-    ax.text(0.03 + share / 2, 0.055, f"{length:g} mm", transform=ax.transAxes, ha="center", va="bottom",
-            fontsize=SMALL_PT, color=colour, path_effects=halo)  # fmt: skip
+    ax.plot(
+        [0.03, 0.03 + share],
+        [0.04, 0.04],
+        transform=ax.transAxes,
+        color=colour,
+        linewidth=2.2,
+        solid_capstyle="butt",
+        path_effects=halo,
+    )
+    ax.text(
+        0.03 + share / 2,
+        0.055,
+        f"{length:g} mm",
+        transform=ax.transAxes,
+        ha="center",
+        va="bottom",
+        fontsize=SMALL_PT,
+        color=colour,
+        path_effects=halo,
+    )
     return length
 
 

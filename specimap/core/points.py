@@ -81,9 +81,7 @@ def cloud_points(
     their standard deviation.
     """
     if (placement.triangle >= 0).all():
-        depth_sigma = caster.interpolate(
-            sigma_of_vertex[:, None], placement.triangle, placement.barycentric
-        ).ravel()
+        depth_sigma = caster.interpolate(sigma_of_vertex[:, None], placement.triangle, placement.barycentric).ravel()
     else:
         depth_sigma = np.full(len(placement.xyz), np.float32(np.median(sigma_of_vertex)))
     step_mm = step_height(placement.pixels, placement.xyz[:, 2], pixel_mm)
@@ -100,6 +98,4 @@ def cloud_points(
         + placement.undercut * np.uint8(Flag.UNDERCUT)
         + (depth_sigma > INTERPOLATED_SIGMA_MM * UNSEEN_SIGMA_MM) * np.uint8(Flag.DEPTH_INTERPOLATED)
     ).astype(np.uint8)
-    return CloudPoints(
-        placement.pixels, placement.xyz, placement.normal, placement.rgb, sigma, flags
-    )
+    return CloudPoints(placement.pixels, placement.xyz, placement.normal, placement.rgb, sigma, flags)

@@ -103,9 +103,16 @@ def refine_mesh(
             views = choose_views(refined.mesh, chosen, photographs, one.views, settings.least_cosine, workers=workers)
         progress(done + 0.2 * share)
         refined = _refined_once(
-            refined, chosen, views, photographs, voxel_mm, settings, one, workers,
+            refined,
+            chosen,
+            views,
+            photographs,
+            voxel_mm,
+            settings,
+            one,
+            workers,
             within(progress, done + 0.2 * share, done + share),
-        )  # fmt: skip
+        )
     progress(1.0)
     return refined
 

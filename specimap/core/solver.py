@@ -122,9 +122,15 @@ def solve(
         excess = max(1.0, float(np.median(norm)) / MEDIAN_OF_RAYLEIGH)
         seen = replace(given, sigma_px=given.sigma_px * excess)
         system = partial(
-            _normal_equations, seen=seen, assembly=assembly, edge_mm=edge_mm, refine_lens=refine_lens, robust=robust,
-            prior_focal=prior_focal, focal_sd=focal_sd,
-        )  # fmt: skip
+            _normal_equations,
+            seen=seen,
+            assembly=assembly,
+            edge_mm=edge_mm,
+            refine_lens=refine_lens,
+            robust=robust,
+            prior_focal=prior_focal,
+            focal_sd=focal_sd,
+        )
         scene, taken, (H, _, cost, weights) = _descend(scene, system, edge_mm, refine_lens, iterations)
         steps += taken
     after = rms_px(scene.residuals(seen))

@@ -64,9 +64,14 @@ def fuse(
     o3d = open3d()
     core = o3d.core
     grid = o3d.t.geometry.VoxelBlockGrid(
-        ("tsdf", "weight", "color"), (core.float32, core.float32, core.float32), ((1,), (1,), (3,)),
-        voxel_mm, BLOCK_VOXELS, FIRST_BLOCKS, core.Device("CPU:0"),
-    )  # fmt: skip
+        ("tsdf", "weight", "color"),
+        (core.float32, core.float32, core.float32),
+        ((1,), (1,), (3,)),
+        voxel_mm,
+        BLOCK_VOXELS,
+        FIRST_BLOCKS,
+        core.Device("CPU:0"),
+    )
     for done, depth_map in enumerate(map(_with_known_depth, maps), 1):
         view = depth_map.view(poses[depth_map.photo])
         depth = o3d.t.geometry.Image(np.ascontiguousarray(depth_map.depth))
@@ -75,9 +80,7 @@ def fuse(
         T = core.Tensor(view.cam_from_world.matrix)
         far = float(depth_map.depth.max()) + 1.0
         try:
-            blocks = grid.compute_unique_block_coordinates(
-                depth, K, T, NEAREST_MM, far, settings.truncation_voxels
-            )
+            blocks = grid.compute_unique_block_coordinates(depth, K, T, NEAREST_MM, far, settings.truncation_voxels)
         except RuntimeError as error:
             # Of every fourth pixel, which is what Open3D looks at, none has depth.
             if "No block is touched" not in str(error):
@@ -96,9 +99,7 @@ def fuse(
     vertices = mesh.vertex.positions.numpy()
     triangles = mesh.triangle.indices.numpy().astype(np.int32)
     colours = np.clip(mesh.vertex.colors.numpy() * 255, 0, 255).astype(np.uint8)
-    vertices, triangles, colours = _largest_parts(
-        vertices, triangles, colours, settings.smallest_part_share
-    )
+    vertices, triangles, colours = _largest_parts(vertices, triangles, colours, settings.smallest_part_share)
     vertices, triangles, colours = _in_order(vertices, triangles, colours)
     return Mesh(vertices, triangles, vertex_normals(vertices, triangles), colours)
 
@@ -154,10 +155,7 @@ def vertex_normals(vertices: NDArray[np.float32], triangles: NDArray[np.int32]) 
     corners: Floats = vertices.astype(float)[triangles]
     face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = np.stack(
-        [
-            np.bincount(triangles.ravel(), np.repeat(face[:, k], 3), minlength=len(vertices))
-            for k in range(3)
-        ],
+        [np.bincount(triangles.ravel(), np.repeat(face[:, k], 3), minlength=len(vertices)) for k in range(3)],
         -1,
     )
     length = np.linalg.norm(normals, axis=1, keepdims=True)

@@ -26,5 +26,6 @@ def check_confinement(settings: ServiceSettings) -> None:
     elif not found.whole:
         logger().warning(
             f"what reads uploaded files is not wholly confined: the kernel or the container offers no {found.missing}",
-            landlock=found.landlock, seccomp=found.seccomp,
-        )  # fmt: skip
+            landlock=found.landlock,
+            seccomp=found.seccomp,
+        )

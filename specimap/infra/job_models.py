@@ -16,18 +16,36 @@ from specimap.infra.models import PRIORITIES, Acquisition, CloudRow, Job
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 PriorityName = Literal["intraoperative", "routine", "research"]
 Dictionary = Literal[
-    "DICT_4X4_50", "DICT_4X4_100", "DICT_4X4_250", "DICT_4X4_1000",
-    "DICT_5X5_50", "DICT_5X5_100", "DICT_5X5_250", "DICT_5X5_1000",
-    "DICT_6X6_50", "DICT_6X6_100", "DICT_6X6_250", "DICT_6X6_1000",
-    "DICT_7X7_50", "DICT_7X7_100", "DICT_7X7_250", "DICT_7X7_1000",
-    "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_16h5", "DICT_APRILTAG_25h9", "DICT_APRILTAG_36h10", "DICT_APRILTAG_36h11",
+    "DICT_4X4_50",
+    "DICT_4X4_100",
+    "DICT_4X4_250",
+    "DICT_4X4_1000",
+    "DICT_5X5_50",
+    "DICT_5X5_100",
+    "DICT_5X5_250",
+    "DICT_5X5_1000",
+    "DICT_6X6_50",
+    "DICT_6X6_100",
+    "DICT_6X6_250",
+    "DICT_6X6_1000",
+    "DICT_7X7_50",
+    "DICT_7X7_100",
+    "DICT_7X7_250",
+    "DICT_7X7_1000",
+    "DICT_ARUCO_ORIGINAL",
+    "DICT_APRILTAG_16h5",
+    "DICT_APRILTAG_25h9",
+    "DICT_APRILTAG_36h10",
+    "DICT_APRILTAG_36h11",
     "DICT_ARUCO_MIP_36h12",
-]  # fmt: skip
+]
 """OpenCV's predefined dictionaries, named here so that no service needs OpenCV to check a name."""
 EdgeMm = Annotated[
     float,
     Field(
-        ge=RANGES["edge_mm"][0], le=RANGES["edge_mm"][1], allow_inf_nan=False,
+        ge=RANGES["edge_mm"][0],
+        le=RANGES["edge_mm"][1],
+        allow_inf_nan=False,
         description="Edge of a marker's black square, mm.",
     ),
 ]
@@ -45,11 +63,17 @@ class JobSettings(BaseModel):
         default="rigid", description="`rigid` squares, or `free` corners as published."
     )
     r_pc: float = Field(
-        default=0.5, ge=RANGES["r_pc"][0], le=RANGES["r_pc"][1], allow_inf_nan=False,
+        default=0.5,
+        ge=RANGES["r_pc"][0],
+        le=RANGES["r_pc"][1],
+        allow_inf_nan=False,
         description="Cell of the fine grid, mm.",
     )
     r_reg: float = Field(
-        default=2.0, ge=RANGES["r_reg"][0], le=RANGES["r_reg"][1], allow_inf_nan=False,
+        default=2.0,
+        ge=RANGES["r_reg"][0],
+        le=RANGES["r_reg"][1],
+        allow_inf_nan=False,
         description="Cell of the coarse grid, mm.",
     )
     backend: Literal["colmap", "mast3r", "da3"] = Field(
@@ -59,8 +83,10 @@ class JobSettings(BaseModel):
         default="auto", description="Features that locate photos which the markers leave open."
     )
     working_px: int = Field(
-        default=1280, ge=RANGES["working_px"][0], le=RANGES["working_px"][1],
-        description="Longer side that larger photos are brought to, pixels."
+        default=1280,
+        ge=RANGES["working_px"][0],
+        le=RANGES["working_px"][1],
+        description="Longer side that larger photos are brought to, pixels.",
     )
     dictionary: Dictionary | None = Field(default=None, description="Marker dictionary; by default the acquisition's.")
     edge_mm: EdgeMm | None = Field(default=None, description="Edge of a marker, mm; by default the acquisition's.")
@@ -134,15 +160,26 @@ def job_views(session: Session, jobs: list[Job]) -> list[JobView]:
     return [
         JobView.model_validate(
             {
-                "id": job.id, "acquisition_id": job.acquisition_id, "settings": job.settings,
-                "priority": names[job.priority], "state": job.state, "stage": job.stage, "progress": job.progress,
-                "error": job.error, "starts": job.starts, "rerun_of": job.rerun_of, "cloud_id": clouds.get(job.id),
-                "seconds": job.seconds, "created_at": job.created_at, "started_at": job.started_at,
-                "finished_at": job.finished_at, "queue_position": positions.get(job.id),
+                "id": job.id,
+                "acquisition_id": job.acquisition_id,
+                "settings": job.settings,
+                "priority": names[job.priority],
+                "state": job.state,
+                "stage": job.stage,
+                "progress": job.progress,
+                "error": job.error,
+                "starts": job.starts,
+                "rerun_of": job.rerun_of,
+                "cloud_id": clouds.get(job.id),
+                "seconds": job.seconds,
+                "created_at": job.created_at,
+                "started_at": job.started_at,
+                "finished_at": job.finished_at,
+                "queue_position": positions.get(job.id),
             }
         )
         for job in jobs
-    ]  # fmt: skip
+    ]
 
 
 def queue_positions(session: Session, ids: list[str]) -> dict[str, int]:

@@ -88,7 +88,10 @@ class ServiceSettings(BaseSettings):
     slots: int = Field(default=1, ge=1, le=64, description="Jobs that one `specimap worker` runs side by side.")
     heartbeat_seconds: float = Field(default=2.0, gt=0, description="How often a worker says that it is alive.")
     lease_seconds: float = Field(
-        default=10.0, gt=0, validate_default=True, description="Silence after which a worker counts as dead and its jobs go to another."
+        default=10.0,
+        gt=0,
+        validate_default=True,
+        description="Silence after which a worker counts as dead and its jobs go to another.",
     )
     stage_seconds: float = Field(default=1800, gt=0, description="Longest time that one stage may take.")
     stage_memory_bytes: int = Field(
@@ -98,7 +101,11 @@ class ServiceSettings(BaseSettings):
         default=3, ge=1, description="Starts after which a job that keeps killing its process is failed."
     )
 
-    patience_seconds: float = Field(default=300, gt=0, description="How long a worker waits for a database or a storage that is away before it gives a job up.")
+    patience_seconds: float = Field(
+        default=300,
+        gt=0,
+        description="How long a worker waits for a database or a storage that is away before it gives a job up.",
+    )
 
     webhook_hosts: list[str] = Field(
         default_factory=list,

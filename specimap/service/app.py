@@ -17,7 +17,7 @@ from specimap.service.auth import Keyring
 from specimap.service.bodies import Gate
 from specimap.service.context import AppContext
 from specimap.service.middleware import Observed
-from specimap.service.routers import (  # fmt: skip
+from specimap.service.routers import (
     acquisitions,
     clouds,
     exports,
@@ -71,8 +71,19 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     problems.install(app)
     problems.describe(app, read_apart=[SpectraRequest])
     for module in (
-        health, keys, acquisitions, files, uploads, jobs, clouds, zarr, spectra, previews, labels, exports,
-    ):  # fmt: skip
+        health,
+        keys,
+        acquisitions,
+        files,
+        uploads,
+        jobs,
+        clouds,
+        zarr,
+        spectra,
+        previews,
+        labels,
+        exports,
+    ):
         app.include_router(module.router)
     # Within what answers browsers' questions and puts uploads right, before all that reads a body.
     app.add_middleware(Gate)
@@ -91,10 +102,28 @@ def create_app(settings: ServiceSettings) -> FastAPI:
 
 
 EXPOSED = [
-    "Accept-Ranges", "Content-Length", "Content-Range", "ETag", "Location", "Retry-After", "X-Correlation-Id",
-    "Tus-Resumable", "Tus-Version", "Tus-Extension", "Tus-Max-Size", "Upload-Offset", "Upload-Length",
-    "Upload-Expires", "Upload-Metadata", "X-Specimap-Total", "X-Specimap-Range", "X-Specimap-Extent-Mm",
-    "X-Specimap-Label-Version", "X-Specimap-Next-Offset", "Tus-Checksum-Algorithm", "Specimap-File",
+    "Accept-Ranges",
+    "Content-Length",
+    "Content-Range",
+    "ETag",
+    "Location",
+    "Retry-After",
+    "X-Correlation-Id",
+    "Tus-Resumable",
+    "Tus-Version",
+    "Tus-Extension",
+    "Tus-Max-Size",
+    "Upload-Offset",
+    "Upload-Length",
+    "Upload-Expires",
+    "Upload-Metadata",
+    "X-Specimap-Total",
+    "X-Specimap-Range",
+    "X-Specimap-Extent-Mm",
+    "X-Specimap-Label-Version",
+    "X-Specimap-Next-Offset",
+    "Tus-Checksum-Algorithm",
+    "Specimap-File",
     "Specimap-Verdict",
-]  # fmt: skip
+]
 """Headers that a page of another origin may read."""

@@ -52,9 +52,15 @@ def new_key(
     """A row to store, and the key itself, which is nowhere kept."""
     row_id, secret = new_id("key"), secrets.token_hex(32)
     row = ApiKey(
-        id=row_id, name=name, secret_hash=_hash(secret), scopes=[s for s in SCOPES if s in scopes],
-        created_at=utc_now(), expires_at=expires_at, rate_per_minute=rate_per_minute, quota_bytes=quota_bytes,
-    )  # fmt: skip
+        id=row_id,
+        name=name,
+        secret_hash=_hash(secret),
+        scopes=[s for s in SCOPES if s in scopes],
+        created_at=utc_now(),
+        expires_at=expires_at,
+        rate_per_minute=rate_per_minute,
+        quota_bytes=quota_bytes,
+    )
     return row, f"{PREFIX}_{row_id.removeprefix('key_')}_{secret}"
 
 

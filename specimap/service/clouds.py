@@ -212,15 +212,21 @@ class OpenClouds:
 
     def _look_up(self, cloud_id: str) -> CloudRecord:
         columns = (
-            CloudRow.id, CloudRow.job_id, CloudRow.acquisition_id, CloudRow.prefix, CloudRow.points, CloudRow.bands,
-            CloudRow.size, CloudRow.created_at,
-        )  # fmt: skip
+            CloudRow.id,
+            CloudRow.job_id,
+            CloudRow.acquisition_id,
+            CloudRow.prefix,
+            CloudRow.points,
+            CloudRow.bands,
+            CloudRow.size,
+            CloudRow.created_at,
+        )
         with self._database.session() as session:
             row = session.execute(
-                sa.select(*columns).join(Job, Job.id == CloudRow.job_id).where(
-                    CloudRow.id == cloud_id, Job.state == "succeeded"
-                )
-            ).one_or_none()  # fmt: skip
+                sa.select(*columns)
+                .join(Job, Job.id == CloudRow.job_id)
+                .where(CloudRow.id == cloud_id, Job.state == "succeeded")
+            ).one_or_none()
             if row is None:
                 raise NotFoundError(f"There is no cloud {cloud_id}.", advice="GET /v1/clouds lists all.")
             labels = {

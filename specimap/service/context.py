@@ -48,9 +48,17 @@ class AppContext:
         database = Database.open(settings.database)
         storage = Storage.open(settings)
         return cls(
-            settings, database, storage, queue_client(database.engine), RateLimiter(), Metrics(database, storage),
-            OpenClouds(storage, database), Judge(settings), JobEvents(database), PictureCache(),
-        )  # fmt: skip
+            settings,
+            database,
+            storage,
+            queue_client(database.engine),
+            RateLimiter(),
+            Metrics(database, storage),
+            OpenClouds(storage, database),
+            Judge(settings),
+            JobEvents(database),
+            PictureCache(),
+        )
 
     def close(self) -> None:
         """Stop the judging process and close the connections."""

@@ -17,13 +17,29 @@ Word = Literal["accepted", "doubtful", "refused"]
 AcquisitionId = Annotated[str, Path(pattern=r"^acq_[0-9a-z]{26}$", examples=["acq_01k0000000000000000000000"])]
 FileId = Annotated[str, Path(pattern=r"^file_[0-9a-z]{26}$", examples=["file_01k0000000000000000000000"])]
 Dictionary = Literal[
-    "DICT_4X4_50", "DICT_4X4_100", "DICT_4X4_250", "DICT_4X4_1000",
-    "DICT_5X5_50", "DICT_5X5_100", "DICT_5X5_250", "DICT_5X5_1000",
-    "DICT_6X6_50", "DICT_6X6_100", "DICT_6X6_250", "DICT_6X6_1000",
-    "DICT_7X7_50", "DICT_7X7_100", "DICT_7X7_250", "DICT_7X7_1000",
-    "DICT_ARUCO_ORIGINAL", "DICT_ARUCO_MIP_36h12",
-    "DICT_APRILTAG_16h5", "DICT_APRILTAG_25h9", "DICT_APRILTAG_36h10", "DICT_APRILTAG_36h11",
-]  # fmt: skip
+    "DICT_4X4_50",
+    "DICT_4X4_100",
+    "DICT_4X4_250",
+    "DICT_4X4_1000",
+    "DICT_5X5_50",
+    "DICT_5X5_100",
+    "DICT_5X5_250",
+    "DICT_5X5_1000",
+    "DICT_6X6_50",
+    "DICT_6X6_100",
+    "DICT_6X6_250",
+    "DICT_6X6_1000",
+    "DICT_7X7_50",
+    "DICT_7X7_100",
+    "DICT_7X7_250",
+    "DICT_7X7_1000",
+    "DICT_ARUCO_ORIGINAL",
+    "DICT_ARUCO_MIP_36h12",
+    "DICT_APRILTAG_16h5",
+    "DICT_APRILTAG_25h9",
+    "DICT_APRILTAG_36h10",
+    "DICT_APRILTAG_36h11",
+]
 """Those of OpenCV, which the service does not load."""
 
 
@@ -84,17 +100,30 @@ class File(BaseModel):
         from_attributes=True,
         json_schema_extra={
             "example": {
-                "id": "file_01k0000000000000000000000", "role": "photo", "label": "photo-0001.jpg", "name": "IMG_1.jpg",
-                "size": 2481273, "sha256": "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08",
-                "state": "accepted", "created_at": "2026-11-22T09:30:00Z", "judgement": {
-                    "kind": "photo", "verdict": "doubtful", "code": "photo_blurred", "reason": "It is shaken.",
-                    "advice": "Take it again: hold still and tap on the specimen to focus.", "width": 4000,
-                    "height": 3000, "sharpness": 0.0021, "marker_ids": [0, 1, 3], "dictionary_seen": None,
+                "id": "file_01k0000000000000000000000",
+                "role": "photo",
+                "label": "photo-0001.jpg",
+                "name": "IMG_1.jpg",
+                "size": 2481273,
+                "sha256": "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08",
+                "state": "accepted",
+                "created_at": "2026-11-22T09:30:00Z",
+                "judgement": {
+                    "kind": "photo",
+                    "verdict": "doubtful",
+                    "code": "photo_blurred",
+                    "reason": "It is shaken.",
+                    "advice": "Take it again: hold still and tap on the specimen to focus.",
+                    "width": 4000,
+                    "height": 3000,
+                    "sharpness": 0.0021,
+                    "marker_ids": [0, 1, 3],
+                    "dictionary_seen": None,
                     "same_as": None,
                 },
             }
         },
-    )  # fmt: skip
+    )
 
     id: str
     role: Role
@@ -127,6 +156,9 @@ def counts(files: Iterable[StoredFile]) -> FileCounts:
         return bool(ends - {HEADER, DATA}) or ends == {HEADER, DATA}
 
     return FileCounts(
-        photos=sum(row.role == "photo" for row in accepted), refused=len(rows) - len(accepted),
-        cube=complete("cube"), white=complete("white"), dark=complete("dark"),
-    )  # fmt: skip
+        photos=sum(row.role == "photo" for row in accepted),
+        refused=len(rows) - len(accepted),
+        cube=complete("cube"),
+        white=complete("white"),
+        dark=complete("dark"),
+    )

@@ -80,10 +80,13 @@ def _photo(context: AppContext, arrival: Arrival, known: Known, path: Path) -> F
         if photo.sha256 == arrival.sha256:
             own = PhotoJudgement.model_validate(photo.judgement).model_copy(
                 update={
-                    "verdict": "refused", "code": "photo_duplicate", "reason": f"It is the same file as {photo.label}.",
-                    "advice": "Take another photo, from another side.", "same_as": photo.label,
+                    "verdict": "refused",
+                    "code": "photo_duplicate",
+                    "reason": f"It is the same file as {photo.label}.",
+                    "advice": "Take another photo, from another side.",
+                    "same_as": photo.label,
                 }
-            )  # fmt: skip
+            )
             return Findings(PurePosixPath(photo.label).suffix, own)
     others = [PhotoJudgement.model_validate(photo.judgement) for photo in known.photos]
     sharpness = [j.sharpness for j in others if j.sharpness is not None and j.code != "photo_blurred"]
@@ -127,9 +130,11 @@ def _paired(own: CubeJudgement, other: CubeJudgement, pair: dict[str, Any]) -> t
         return _updated(own, update), _updated(other, update)
     blamed = "header" if pair["code"] == CubeHeaderError.code else "data"
     beside = {
-        **words, "verdict": "doubtful", "waiting_for": blamed,
+        **words,
+        "verdict": "doubtful",
+        "waiting_for": blamed,
         "reason": f"The {blamed} beside it cannot be used. {pair['reason']}",
-    }  # fmt: skip
+    }
     if own.part == blamed:
         kept = {"verdict": "accepted", "code": None, "reason": "", "advice": "", "waiting_for": blamed}
         return _updated(own, {**words, **facts, "waiting_for": None}), _updated(other, kept)
@@ -172,10 +177,11 @@ def _fitted(role: str, own: CubeJudgement, known: Known) -> CubeJudgement:
             continue
         name = other if role == "cube" else role
         words = {
-            "verdict": "doubtful" if role == "cube" else "refused", "code": "cube_content_invalid",
+            "verdict": "doubtful" if role == "cube" else "refused",
+            "code": "cube_content_invalid",
             "reason": f"The {name} reference has {reference[0]} columns and {reference[1]} bands, "
             f"the cube {cube[0]} and {cube[1]}.",
             "advice": f"Give the {name} reference that was recorded with the cube, with the same binning.",
-        }  # fmt: skip
+        }
         return _updated(own, words)
     return own

@@ -126,18 +126,32 @@ def _written(context: AppContext, arrival: Arrival, known: Known, findings: Find
                 session.flush()
         state = "refused" if findings.own.verdict == "refused" else "accepted"
         stored = StoredFile(
-            id=arrival.file_id, acquisition_id=arrival.acquisition_id, role=arrival.role, name=arrival.name,
-            label=_label(arrival.role, findings.suffix, state, labels), size=arrival.size, sha256=arrival.sha256,
-            storage_key=key, state=state, judgement=findings.own.model_dump(mode="json"), created_by=arrival.key_id,
-        )  # fmt: skip
+            id=arrival.file_id,
+            acquisition_id=arrival.acquisition_id,
+            role=arrival.role,
+            name=arrival.name,
+            label=_label(arrival.role, findings.suffix, state, labels),
+            size=arrival.size,
+            sha256=arrival.sha256,
+            storage_key=key,
+            state=state,
+            judgement=findings.own.model_dump(mode="json"),
+            created_by=arrival.key_id,
+        )
         session.add(stored)
         if arrival.upload_id is not None:
             upload = session.get_one(Upload, arrival.upload_id)
             upload.state, upload.file_id = "finished", arrival.file_id
         audit(
-            session, arrival.key_id, "file.create", arrival.file_id, acquisition=arrival.acquisition_id,
-            role=arrival.role, state=state, size=arrival.size,
-        )  # fmt: skip
+            session,
+            arrival.key_id,
+            "file.create",
+            arrival.file_id,
+            acquisition=arrival.acquisition_id,
+            role=arrival.role,
+            state=state,
+            size=arrival.size,
+        )
     return stored
 
 

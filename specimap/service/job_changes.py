@@ -44,9 +44,11 @@ def new_job(context: AppContext, key_id: str, wanted: JobRequest, idempotency_ke
         if acquisition is None:
             raise _no_acquisition(wanted.acquisition_id)
         return Job(
-            acquisition_id=acquisition.id, settings=wanted.settings.on(acquisition),
-            priority=PRIORITIES[wanted.priority], webhook=_checked(context, wanted.webhook),
-        )  # fmt: skip
+            acquisition_id=acquisition.id,
+            settings=wanted.settings.on(acquisition),
+            priority=PRIORITIES[wanted.priority],
+            webhook=_checked(context, wanted.webhook),
+        )
 
     return _made_once(context, key_id, idempotency_key, wanted.digest(), row)
 
@@ -63,10 +65,12 @@ def repeated_job(
         if "webhook" not in wanted.model_fields_set and earlier.webhook is not None:
             webhook = Webhook(**earlier.webhook)
         return Job(
-            acquisition_id=earlier.acquisition_id, settings=job_settings({**earlier.settings, **changed}).model_dump(),
+            acquisition_id=earlier.acquisition_id,
+            settings=job_settings({**earlier.settings, **changed}).model_dump(),
             priority=PRIORITIES[wanted.priority] if wanted.priority else earlier.priority,
-            webhook=_checked(context, webhook), rerun_of=earlier.id,
-        )  # fmt: skip
+            webhook=_checked(context, webhook),
+            rerun_of=earlier.id,
+        )
 
     return _made_once(context, key_id, idempotency_key, wanted.digest(job_id), row)
 

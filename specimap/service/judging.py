@@ -41,9 +41,12 @@ class Judge:
     def __init__(self, settings: ServiceSettings, command: Sequence[str] = COMMAND) -> None:
         self._settings = settings
         self._command = (
-            *command, str(settings.judge_memory_bytes), str(settings.max_cube_bytes), settings.sandbox,
+            *command,
+            str(settings.judge_memory_bytes),
+            str(settings.max_cube_bytes),
+            settings.sandbox,
             *map(str, settings.private_places),
-        )  # fmt: skip
+        )
         # Threads of its own: a child dies with the thread that started it, and the app's threads come and go.
         self._threads = ThreadPoolExecutor(CHILDREN, thread_name_prefix="judge")
         self._own = threading.local()
@@ -158,9 +161,13 @@ def _hostile(kind: str, *, slow: bool) -> Verdict:
     facts: Verdict = {"part": "data", "suffix": ".bin"} if kind == "part" else {}
     if kind == "photo":
         facts = {
-            "suffix": ".bin", "width": None, "height": None, "sharpness": None, "marker_ids": [],
+            "suffix": ".bin",
+            "width": None,
+            "height": None,
+            "sharpness": None,
+            "marker_ids": [],
             "dictionary_seen": None,
-        }  # fmt: skip
+        }
     reason = f"The {'photo' if kind == 'photo' else 'cube'} {what}: it is damaged, or made to do so."
     advice = "Copy it from the camera again."
     return {"verdict": "refused", "code": code, "reason": reason, "advice": advice, **facts}
@@ -177,9 +184,14 @@ class _Child:
         environment = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
         threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
         self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, bufsize=0,
-            start_new_session=True, env={**environment, **threads, "TMPDIR": str(scratch)},
-        )  # fmt: skip
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            bufsize=0,
+            start_new_session=True,
+            env={**environment, **threads, "TMPDIR": str(scratch)},
+        )
         self._buffer = b""
 
     def alive(self) -> bool:

@@ -105,9 +105,16 @@ def put_label(
                 prefix = f"clouds/{cloud_id}/labels/{name}/v{version}-{uuid4().hex[:8]}"
                 stored = metadata.as_stored()
                 row = LabelVersion(
-                    cloud_id=cloud_id, name=name, version=version, kind=metadata.kind, classes=stored["classes"],
-                    made_by=stored["made_by"], storage_prefix=prefix, sha256=digest, created_by=principal.key_id,
-                )  # fmt: skip
+                    cloud_id=cloud_id,
+                    name=name,
+                    version=version,
+                    kind=metadata.kind,
+                    classes=stored["classes"],
+                    made_by=stored["made_by"],
+                    storage_prefix=prefix,
+                    sha256=digest,
+                    created_by=principal.key_id,
+                )
                 session.add(row)
                 audit(session, principal.key_id, "label.put", cloud_id, layer=name, version=version)
                 session.flush()

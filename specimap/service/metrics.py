@@ -23,9 +23,12 @@ class Metrics:
     def __init__(self, database: Database, storage: Storage) -> None:
         self.registry = CollectorRegistry()
         self._requests = Histogram(
-            "specimap_requests_handle_seconds", "Time to answer a request.", ("method", "route", "status"),
-            buckets=REQUEST_BUCKETS, registry=self.registry,
-        )  # fmt: skip
+            "specimap_requests_handle_seconds",
+            "Time to answer a request.",
+            ("method", "route", "status"),
+            buckets=REQUEST_BUCKETS,
+            registry=self.registry,
+        )
         self.uploaded = Counter("specimap_uploads_receive_bytes", "Bytes taken in by uploads.", registry=self.registry)
         self.judged = Counter(
             "specimap_files_judge_total", "Files judged on arrival, by verdict.", ("verdict",), registry=self.registry

@@ -159,11 +159,15 @@ class FormFiles:
             state.pending.append(("data", piece[start:end]))
 
         return {
-            "on_part_begin": begin, "on_header_field": header_field, "on_header_value": header_value,
-            "on_header_end": header_end, "on_headers_finished": headers_finished, "on_part_data": data,
+            "on_part_begin": begin,
+            "on_header_field": header_field,
+            "on_header_value": header_value,
+            "on_header_end": header_end,
+            "on_headers_finished": headers_finished,
+            "on_part_data": data,
             "on_part_end": lambda: state.pending.append(("part end", b"")),
             "on_end": lambda: state.pending.append(("end", b"")),
-        }  # fmt: skip
+        }
 
     def _feed(self, parser: MultipartParser, data: bytes, came: int) -> None:
         parser.write(data)

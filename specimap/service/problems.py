@@ -34,12 +34,17 @@ class Problem(BaseModel):
     model_config = ConfigDict(
         json_schema_extra={
             "example": {
-                "type": "urn:specimap:error:not_found", "title": "not_found", "status": 404, "code": "not_found",
-                "detail": "There is no job job_01k0000000000000000000000.", "advice": "Check the id.", "details": {},
+                "type": "urn:specimap:error:not_found",
+                "title": "not_found",
+                "status": 404,
+                "code": "not_found",
+                "detail": "There is no job job_01k0000000000000000000000.",
+                "advice": "Check the id.",
+                "details": {},
                 "correlation_id": "5f0c2a9d8b7e4c31",
             }
         }
-    )  # fmt: skip
+    )
 
     type: str = Field(description="URN of the error's kind.")
     title: str = Field(description="The code, again, as RFC 9457 wants a title.")
@@ -66,9 +71,15 @@ def problem_response(error: SpecimapError, status: int | None = None, **headers:
     if isinstance(error, UnauthorizedError):
         headers["WWW-Authenticate"] = "Bearer"
     body = Problem(
-        type=f"urn:specimap:error:{error.code}", title=error.code, status=status, code=error.code, detail=error.message,
-        advice=error.advice, details=error.details, correlation_id=correlation_id(),
-    )  # fmt: skip
+        type=f"urn:specimap:error:{error.code}",
+        title=error.code,
+        status=status,
+        code=error.code,
+        detail=error.message,
+        advice=error.advice,
+        details=error.details,
+        correlation_id=correlation_id(),
+    )
     return JSONResponse(body.model_dump(mode="json"), status, headers, MEDIA_TYPE)
 
 

@@ -73,17 +73,26 @@ class Select(_OneOf):
     """Which points: exactly one of these."""
 
     indices: list[_Number] | None = Field(
-        default=None, min_length=1, max_length=MOST_POINTS, fail_fast=True,
+        default=None,
+        min_length=1,
+        max_length=MOST_POINTS,
+        fail_fast=True,
         description="Points by number, in this order.",
     )
     pixels: list[tuple[_Pixel, _Pixel]] | None = Field(
-        default=None, min_length=1, max_length=MOST_POINTS, fail_fast=True,
+        default=None,
+        min_length=1,
+        max_length=MOST_POINTS,
+        fail_fast=True,
         description="Points by row and column of the cube, in this order; a pixel without a point is left out.",
-    )  # fmt: skip
+    )
     polygon: list[tuple[_Coordinate, _Coordinate]] | None = Field(
-        default=None, min_length=3, max_length=MOST_VERTICES, fail_fast=True,
+        default=None,
+        min_length=3,
+        max_length=MOST_VERTICES,
+        fail_fast=True,
         description="Points whose pixel's centre lies in the closed polygon of (row, column); even-odd rule.",
-    )  # fmt: skip
+    )
     nearest: Nearest | None = None
     box: Box | None = None
     radius: Radius | None = None
@@ -117,13 +126,16 @@ class SpectraRequest(_Strict):
     select: Select
     bands: Bands | None = Field(default=None, description="All bands where absent.")
     fields: list[FieldName] = Field(
-        default_factory=list, max_length=7,
+        default_factory=list,
+        max_length=7,
         description="Columns beside index and spectrum; `distance_mm` goes with `nearest` and `radius`.",
-    )  # fmt: skip
+    )
     limit: int | None = Field(
-        default=None, ge=1, le=MOST_POINTS,
+        default=None,
+        ge=1,
+        le=MOST_POINTS,
         description=f"Most points; {PAGE} where absent, in JSON {JSON_PAGE} and never more than {MOST_JSON_POINTS}.",
-    )  # fmt: skip
+    )
     offset: int = Field(default=0, ge=0, le=2**32, description="Points of the selection to leave out before.")
 
     @model_validator(mode="after")

@@ -121,10 +121,12 @@ class UploadStore(TusStorage):
         if upload is None:
             return None
         return {
-            "metadata": {"filename": uid, "filetype": "application/octet-stream"}, "size": upload.size,
-            "offset": await self.size(uid), "created_at": upload.created_at.isoformat(),
+            "metadata": {"filename": uid, "filetype": "application/octet-stream"},
+            "size": upload.size,
+            "offset": await self.size(uid),
+            "created_at": upload.created_at.isoformat(),
             "expires": http_date(upload) if upload.state == "open" else None,
-        }  # fmt: skip
+        }
 
     async def write_info(self, uid: str, data: dict[str, Any]) -> None:
         """Nothing: the row and the file's size say all."""

@@ -62,10 +62,16 @@ def create(
     check_size(context.settings, role, size)
     now = utc_now()
     upload = Upload(
-        id=new_id("up"), acquisition_id=acquisition_id, role=role, name=shown_name(metadata.get("filename", "")),
-        size=size, state="open", created_at=now, created_by=principal.key_id,
+        id=new_id("up"),
+        acquisition_id=acquisition_id,
+        role=role,
+        name=shown_name(metadata.get("filename", "")),
+        size=size,
+        state="open",
+        created_at=now,
+        created_by=principal.key_id,
         expires_at=now + datetime.timedelta(hours=context.settings.upload_hours),
-    )  # fmt: skip
+    )
     files.create(upload.id)
     try:
         with context.database.session() as session:
@@ -175,10 +181,17 @@ def _finish(context: AppContext, files: UploadFiles, upload: Upload) -> None:
         take_in(
             context,
             Arrival(
-                file_id, upload.acquisition_id, upload.role, upload.name, aside, upload.size, digest,
-                upload.created_by, upload_id=upload.id,
+                file_id,
+                upload.acquisition_id,
+                upload.role,
+                upload.name,
+                aside,
+                upload.size,
+                digest,
+                upload.created_by,
+                upload_id=upload.id,
             ),
-        )  # fmt: skip
+        )
     except JobConflictError as error:
         with context.database.session() as session:
             row = session.get_one(Upload, upload.id)

@@ -18,8 +18,10 @@ SUFFIX = re.compile(r"\.[a-z0-9]{1,8}")
 CODE = re.compile(r"[a-z0-9_]{1,64}")
 _CONTROLS = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]+")
 _MODELS: dict[str, type[PhotoJudgement | CubeJudgement]] = {
-    "photo": PhotoJudgement, "part": CubeJudgement, "cube": CubeJudgement,
-}  # fmt: skip
+    "photo": PhotoJudgement,
+    "part": CubeJudgement,
+    "cube": CubeJudgement,
+}
 
 
 def checked_verdict(kind: str, said: object) -> dict[str, Any]:

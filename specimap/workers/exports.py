@@ -78,9 +78,11 @@ def run_export(
     except (CancelledError, DatabaseUnavailableError):
         raise
     except Exception as error:
-        failure = error if isinstance(error, SpecimapError) else SpecimapError(
-            "An error that Specimap does not know.", advice="Report it with the correlation id."
-        )  # fmt: skip
+        failure = (
+            error
+            if isinstance(error, SpecimapError)
+            else SpecimapError("An error that Specimap does not know.", advice="Report it with the correlation id.")
+        )
         logger().error("export failed", export=export_id, code=failure.code, exc_info=error)
         described = failure.as_dict()
         # The path of a scratch folder says nothing to a client.
@@ -211,16 +213,26 @@ def _run_once(
     cancelled: Callable[[], bool],
 ) -> tuple[int, str]:
     command = [
-        sys.executable, "-m", "specimap.workers.export_main", str(cell.given), format.value, str(target),
-        str(os.getpid()), str(settings.stage_memory_bytes),
-    ]  # fmt: skip
+        sys.executable,
+        "-m",
+        "specimap.workers.export_main",
+        str(cell.given),
+        format.value,
+        str(target),
+        str(os.getpid()),
+        str(settings.stage_memory_bytes),
+    ]
     with tempfile.TemporaryFile(dir=cell.folder) as answer, tempfile.TemporaryFile(dir=cell.folder) as said:
         # A session of its own: a kill reaches whatever it starts, and the terminal's signals do not reach it. It holds
         # no file of the worker's: it could empty that of the log.
         process = subprocess.Popen(
-            cells.confined(command, cell, backends=False), stdin=subprocess.DEVNULL, stdout=answer, stderr=said,
-            start_new_session=True, env=cells.environment(cell),
-        )  # fmt: skip
+            cells.confined(command, cell, backends=False),
+            stdin=subprocess.DEVNULL,
+            stdout=answer,
+            stderr=said,
+            start_new_session=True,
+            env=cells.environment(cell),
+        )
         try:
             _wait(process, settings, held, cancelled)
         finally:

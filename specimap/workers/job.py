@@ -143,10 +143,15 @@ class JobRun:
 
     def _cloud(self, job: Job, outcome: dict[str, Any], report: Report) -> CloudRow:
         return CloudRow(
-            id=new_id("cloud"), job_id=job.id, acquisition_id=job.acquisition_id, prefix=outcome["prefix"],
-            points=report.coverage.points, bands=outcome["bands"], size=outcome["size"],
+            id=new_id("cloud"),
+            job_id=job.id,
+            acquisition_id=job.acquisition_id,
+            prefix=outcome["prefix"],
+            points=report.coverage.points,
+            bands=outcome["bands"],
+            size=outcome["size"],
             report=report.model_dump(mode="json"),
-        )  # fmt: skip
+        )
 
     # ---- stages ---------------------------------------------------------------------------------------
 

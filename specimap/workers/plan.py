@@ -18,9 +18,14 @@ from specimap.infra.models import Acquisition, Job, StoredFile
 from specimap.infra.storage import Storage
 
 DEFAULTS: dict[str, Any] = {
-    "method": "camera", "adjustment": "rigid", "r_pc": 0.5, "r_reg": 2.0, "backend": "colmap", "features": "auto",
+    "method": "camera",
+    "adjustment": "rigid",
+    "r_pc": 0.5,
+    "r_reg": 2.0,
+    "backend": "colmap",
+    "features": "auto",
     "working_px": 1280,
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)
@@ -78,14 +83,20 @@ def plan_of(database: Database, job_id: str) -> Plan:
     if not photos or not any(row.role == "cube" for row in rows):
         raise NotFoundError("The acquisition's photos or its cube are gone.", advice="Upload them, then rerun the job.")
     chosen = {
-        **DEFAULTS, "edge_mm": acquisition.edge_mm, "dictionary": acquisition.dictionary,
+        **DEFAULTS,
+        "edge_mm": acquisition.edge_mm,
+        "dictionary": acquisition.dictionary,
         **{name: value for name, value in job.settings.items() if value is not None},
-    }  # fmt: skip
+    }
     settings = settings_from(**chosen)
     keys = surface_keys(photos, settings)
     digest = hashlib.sha256(json_text(cube, sort_keys=True).encode()).hexdigest()
     keys["register"] = register_key(keys["render"], digest, settings)
     return Plan(
-        job.id, acquisition.id, files, chosen, keys,
+        job.id,
+        acquisition.id,
+        files,
+        chosen,
+        keys,
         {"cube": digest, "photos": digest_of(photos), "acquisition": acquisition.id, "job": job.id},
-    )  # fmt: skip
+    )

@@ -48,9 +48,16 @@ def _run(spec: dict[str, Any], out: TextIO) -> None:
 
     paths = {name: Path(path) for name, path in spec["inputs"].items()}
     run = StageRun(
-        spec["stage"], Inputs(**paths), Path(spec["out"]), settings_from(**spec["settings"]), spec["keys"],
-        spec["seconds"], spec["reused"], spec["hashes"], spec["workers"],
-    )  # fmt: skip
+        spec["stage"],
+        Inputs(**paths),
+        Path(spec["out"]),
+        settings_from(**spec["settings"]),
+        spec["keys"],
+        spec["seconds"],
+        spec["reused"],
+        spec["hashes"],
+        spec["workers"],
+    )
     seconds = run_stage(run, progress=lambda stage, share: _say(out, event="progress", stage=stage, share=share))
     _say(out, event="done", seconds=seconds)
 

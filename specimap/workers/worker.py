@@ -162,9 +162,14 @@ class Worker:
             stop = threading.Event()
             try:
                 await asyncio.to_thread(
-                    run_export, export_id, self._database, self._storage, self.settings, self.executor,
+                    run_export,
+                    export_id,
+                    self._database,
+                    self._storage,
+                    self.settings,
+                    self.executor,
                     cancelled=stop.is_set,
-                )  # fmt: skip
+                )
             finally:
                 stop.set()
             return "done"

@@ -29,9 +29,12 @@ class Acquisitions:
     ) -> Acquisition:
         """A new acquisition. Not repeated after a lost answer: look into :meth:`list` for it first."""
         body = {
-            "specimen_id": specimen_id, "accession_number": accession_number, "dictionary": dictionary,
-            "edge_mm": edge_mm, "notes": notes,
-        }  # fmt: skip
+            "specimen_id": specimen_id,
+            "accession_number": accession_number,
+            "dictionary": dictionary,
+            "edge_mm": edge_mm,
+            "notes": notes,
+        }
         return Acquisition.of(self._session.json("POST", path("acquisitions"), json=body))
 
     def get(self, acquisition: Acquisition | str) -> Acquisition:
@@ -85,9 +88,7 @@ class Acquisitions:
         Raises:
             UploadFailed: a file did not arrive; ``files`` are those that did.
         """
-        return upload(
-            self._session, id_of(acquisition), photos, cube, white, dark, progress, resume_file, patience_s
-        )  # fmt: skip
+        return upload(self._session, id_of(acquisition), photos, cube, white, dark, progress, resume_file, patience_s)
 
     def files(self, acquisition: Acquisition | str) -> builtins.list[File]:
         """All files, refused ones too."""

@@ -49,9 +49,14 @@ class Client:
         if not url:
             raise NotConfigured(f"There is no address. Give url, or set {URL_VARIABLE}.")
         self._session = Session(
-            url, key or None, timeout=timeout, retries=retries or Retries(), transport=transport, verify=verify,
+            url,
+            key or None,
+            timeout=timeout,
+            retries=retries or Retries(),
+            transport=transport,
+            verify=verify,
             correlation_id=correlation_id,
-        )  # fmt: skip
+        )
         self.acquisitions = Acquisitions(self._session)
         self.jobs = Jobs(self._session)
         self.clouds = Clouds(self._session)

@@ -207,7 +207,7 @@ class Cloud:
         """
         return self._session.request(
             "GET", path("clouds", self.id, "previews", f"{kind}.png"), params=parameters
-        ).content  # fmt: skip
+        ).content
 
     def export(
         self,
@@ -266,9 +266,7 @@ class Cloud:
             ValueError: the values do not fit the cloud.
             Conflict: another version has come meanwhile.
         """
-        return _labels.put_label(
-            self._session, self.id, self.points, name, values, classes, made_by, if_version
-        )  # fmt: skip
+        return _labels.put_label(self._session, self.id, self.points, name, values, classes, made_by, if_version)
 
 
 class Clouds:

@@ -207,9 +207,13 @@ def error_of(response: httpx.Response) -> SpecimapClientError:
     correlation = body.get("correlation_id") or response.headers.get("X-Correlation-Id", "")
     details = body.get("details")
     error: ApiError = leaf_of(status)(
-        str(body["code"]), str(body.get("detail") or ""), str(body.get("advice") or ""),
-        details if isinstance(details, dict) else {}, status, str(correlation),
-    )  # fmt: skip
+        str(body["code"]),
+        str(body.get("detail") or ""),
+        str(body.get("advice") or ""),
+        details if isinstance(details, dict) else {},
+        status,
+        str(correlation),
+    )
     if isinstance(error, RateLimited):
         error.retry_after = seconds_of(response.headers.get("Retry-After"))
     return error

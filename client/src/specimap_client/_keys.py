@@ -30,10 +30,12 @@ class Keys:
     ) -> NewKey:
         """A new key; its ``key`` is shown this once. ``expires_at`` is aware."""
         body = {
-            "name": name, "scopes": builtins.list(scopes), "rate_per_minute": rate_per_minute,
+            "name": name,
+            "scopes": builtins.list(scopes),
+            "rate_per_minute": rate_per_minute,
             "quota_bytes": quota_bytes,
             "expires_at": None if expires_at is None else expires_at.astimezone(datetime.UTC).isoformat(),
-        }  # fmt: skip
+        }
         return NewKey.of(self._session.json("POST", path("keys"), json=body))
 
     def list(self) -> builtins.list[Key]:

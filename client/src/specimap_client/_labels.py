@@ -44,9 +44,7 @@ class Label(Model):
         """Classes (S,), or probabilities (S,) or (S, C), of all points."""
         assert self._session is not None, "labels come from the service"
         address = path("clouds", self.cloud_id, "labels", self.name, "values")
-        answer = self._session.request(
-            "GET", address, params={"version": self.version}, headers={"Accept": NPY}
-        )  # fmt: skip
+        answer = self._session.request("GET", address, params={"version": self.version}, headers={"Accept": NPY})
         return npy_of(answer)
 
 

@@ -39,9 +39,12 @@ def pages(session: Session, cloud: str, query: Query, page: int) -> Iterator[Spe
         offset: int | None = 0
         while offset is not None:
             body = {
-                "select": selection, "bands": query.bands, "fields": list(query.fields), "limit": page,
+                "select": selection,
+                "bands": query.bands,
+                "fields": list(query.fields),
+                "limit": page,
                 "offset": offset,
-            }  # fmt: skip
+            }
             found, offset = (_by_arrow if arrow else _by_npy)(session, address, body, query)
             yield found
 

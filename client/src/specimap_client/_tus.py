@@ -88,8 +88,10 @@ class Tus:
                     if failures >= self._session.retries.attempts:
                         raise UploadFailed(
                             f"{file.name}: no byte more arrived in {failures} attempts. {error}",
-                            path=str(file), upload_id=upload, advice="Upload again: it goes on where it stopped.",
-                        ) from error  # fmt: skip
+                            path=str(file),
+                            upload_id=upload,
+                            advice="Upload again: it goes on where it stopped.",
+                        ) from error
                     wait = error.retry_after if isinstance(error, RateLimited) else None
                     offset = None
                     _retries.sleep(self._session.retries.delay(failures - 1, wait))

@@ -93,8 +93,10 @@ def _send(tus: Tus, item: _Item, notes: _Notes, tell: Callable[[int], None], pat
         if digest is not None and digest != file.sha256:
             raise UploadFailed(
                 f"{item.path.name} arrived with another content than it has here.",
-                path=str(item.path), code="checksum_wrong", advice="Delete the file there and upload it again.",
-            )  # fmt: skip
+                path=str(item.path),
+                code="checksum_wrong",
+                advice="Delete the file there and upload it again.",
+            )
         tell(item.size)
         return replace(file, path=item.path)
     raise AssertionError("the second upload is a new one")
@@ -129,9 +131,11 @@ def _with_data(given: AnyPath | Sequence[AnyPath] | None) -> list[Path]:
     if len(found) != 1:
         what = "No data file lies" if not found else "Several data files lie"
         raise UploadFailed(
-            f"{what} beside {header.name}.", path=str(header), code="cube_not_found",
+            f"{what} beside {header.name}.",
+            path=str(header),
+            code="cube_not_found",
             advice="Name both: (header, data).",
-        )  # fmt: skip
+        )
     return [header, found[0]]
 
 

@@ -14,8 +14,14 @@ from specimap.core.errors import CubeHeaderError
 from specimap.core.geometry import Floats
 
 _NO_DATA = (
-    "fillvalue", "missingvalue", "nodata", "nodatavalue", "dataignorevalue", "ignorevalue", "gdalnodata",
-)  # fmt: skip
+    "fillvalue",
+    "missingvalue",
+    "nodata",
+    "nodatavalue",
+    "dataignorevalue",
+    "ignorevalue",
+    "gdalnodata",
+)
 _CF_SCALE = "scale_factor"
 _GAINS = ("scalefactor", "datagainvalues")
 _OFFSETS = ("addoffset", "dataoffsetvalues")
@@ -28,10 +34,20 @@ _BITS = "bitdepth"
 _VALID = ("validmin", "validmax", "validrange")
 _UNSIGNED = "unsigned"
 _EXPOSURE = ("tint", "integrationtime", "exposuretime", "exposure")
-WORDS = frozenset((
-    *_NO_DATA, *_GAINS, *_OFFSETS, *_REFLECTANCE_GAINS, *_REFLECTANCE_OFFSETS, _DIVISOR, *_CEILING, _BITS, *_VALID,
-    *_EXPOSURE,
-))  # fmt: skip
+WORDS = frozenset(
+    (
+        *_NO_DATA,
+        *_GAINS,
+        *_OFFSETS,
+        *_REFLECTANCE_GAINS,
+        *_REFLECTANCE_OFFSETS,
+        _DIVISOR,
+        *_CEILING,
+        _BITS,
+        *_VALID,
+        *_EXPOSURE,
+    )
+)
 """What the names of attributes and variables are compared with, see :func:`plain`."""
 # What other quantities are called, or their units, in which values may lie between 0 and 1 as well.
 _OTHER_QUANTITY = re.compile(
@@ -158,8 +174,9 @@ def check_counts(file_name: str, declared: Declared, bands: int) -> None:
             raise CubeHeaderError(
                 f"{file_name}: '{field}' holds {numbers.size} numbers; the cube has {bands} bands.",
                 advice=f"Give one number for each band in '{field}', or export the cube again.",
-                field=field, value=str(numbers.size),
-            )  # fmt: skip
+                field=field,
+                value=str(numbers.size),
+            )
 
 
 def _divides(name: str, scale: Floats, *, named: bool) -> bool:
@@ -182,8 +199,9 @@ def _wrong(file_name: str, field: str, value: object, why: str) -> CubeHeaderErr
     return CubeHeaderError(
         f"{file_name}: '{field} = {shown}' {why}.",
         advice=f"Correct '{field}', or export the cube again.",
-        field=field, value=shown,
-    )  # fmt: skip
+        field=field,
+        value=shown,
+    )
 
 
 def _text(value: object) -> object:

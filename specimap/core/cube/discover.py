@@ -133,8 +133,9 @@ def _wrong_type(path: Path, variable: Variable) -> CubeHeaderError:
     return CubeHeaderError(
         f"'{shown(variable.name)}' in {path.name} holds values of type {shown(str(variable.dtype))}.",
         advice="Save the cube as integers or real floating-point numbers.",
-        field="dtype", value=shown(str(variable.dtype)),
-    )  # fmt: skip
+        field="dtype",
+        value=shown(str(variable.dtype)),
+    )
 
 
 def _refusal(path: Path, what: str, variables: Sequence[Variable]) -> CubeFormatError:
@@ -164,9 +165,10 @@ def choose_wavelengths(variables: Sequence[Variable], cube: Variable) -> Variabl
     told = [
         v
         for v in variables
-        if v.text is not None and _UNITS_NAME.search(v.short_name)
+        if v.text is not None
+        and _UNITS_NAME.search(v.short_name)
         and (_WAVELENGTH_NAME.search(v.short_name) or read_unit(v.text).kind not in ("none", "unrecognised"))
-    ]  # fmt: skip
+    ]
     nearest = max(told, key=lambda v: _groups_shared(v, best), default=None)
     return replace(best, units=nearest.text if nearest else _units_in_name(best.short_name))
 
@@ -174,18 +176,21 @@ def choose_wavelengths(variables: Sequence[Variable], cube: Variable) -> Variabl
 def arrays_beside(variables: Sequence[Variable], cube: Variable) -> list[Variable]:
     """Arrays of numbers in the cube's own group, the cube aside."""
     return [
-        v for v in variables
+        v
+        for v in variables
         if _group(v) == _group(cube) and v.name != cube.name and v.text is None and readable_dtype(v.dtype)
-    ]  # fmt: skip
+    ]
 
 
 def _spectral_vectors(variables: Sequence[Variable]) -> list[Variable]:
     vectors = [
         v
         for v in variables
-        if v.shape and 1 <= math.prod(v.shape) == max(v.shape) <= _MOST_WAVELENGTHS and readable_dtype(v.dtype)
+        if v.shape
+        and 1 <= math.prod(v.shape) == max(v.shape) <= _MOST_WAVELENGTHS
+        and readable_dtype(v.dtype)
         and not _NO_WAVELENGTH.search(v.short_name)
-    ]  # fmt: skip
+    ]
     named = [v for v in vectors if _WAVELENGTH_NAME.search(v.short_name)]
     return named or [v for v in vectors if _SPECTRAL_NAME.search(v.short_name) and _has_spectral_unit(v)]
 

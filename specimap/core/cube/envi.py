@@ -21,10 +21,46 @@ _HEADER_SUFFIX = ".hdr"
 _DATA_SUFFIXES = ("", ".raw", ".img", ".dat", ".bil", ".bip", ".bsq", ".bin", ".hyspex", ".cube", ".hsi", ".envi")
 # What instruments and programs put beside a cube under its name; none of it is taken for the data.
 _OTHER_SUFFIXES = {
-    ".hdr", ".txt", ".xml", ".json", ".log", ".csv", ".tsv", ".ini", ".md", ".pdf", ".html", ".yaml", ".yml",
-    ".png", ".jpg", ".jpeg", ".bmp", ".gif", ".tif", ".tiff", ".ovr", ".enp", ".sta", ".prj", ".lut", ".roi", ".evf",
-    ".npy", ".npz", ".mat", ".h5", ".hdf5", ".he5", ".nc", ".zip", ".gz", ".bak", ".tmp", ".part",
-}  # fmt: skip
+    ".hdr",
+    ".txt",
+    ".xml",
+    ".json",
+    ".log",
+    ".csv",
+    ".tsv",
+    ".ini",
+    ".md",
+    ".pdf",
+    ".html",
+    ".yaml",
+    ".yml",
+    ".png",
+    ".jpg",
+    ".jpeg",
+    ".bmp",
+    ".gif",
+    ".tif",
+    ".tiff",
+    ".ovr",
+    ".enp",
+    ".sta",
+    ".prj",
+    ".lut",
+    ".roi",
+    ".evf",
+    ".npy",
+    ".npz",
+    ".mat",
+    ".h5",
+    ".hdf5",
+    ".he5",
+    ".nc",
+    ".zip",
+    ".gz",
+    ".bak",
+    ".tmp",
+    ".part",
+}
 # From the file's axes to (rows, cols, bands).
 _FILE_SHAPE = {"bip": (0, 1, 2), "bil": (0, 2, 1), "bsq": (2, 0, 1)}
 _TO_CUBE = {"bip": (0, 1, 2), "bil": (0, 2, 1), "bsq": (1, 2, 0)}
@@ -136,8 +172,9 @@ def _truncated(path: Path, expected: int, found: int) -> CubeTruncatedError:
     return CubeTruncatedError(
         f"{path.name} holds {found} bytes, its header asks for {expected}.",
         advice="Copy the cube again, completely; or correct lines, samples, bands, data type in the header.",
-        expected_bytes=expected, found_bytes=found,
-    )  # fmt: skip
+        expected_bytes=expected,
+        found_bytes=found,
+    )
 
 
 def _longer(excess: int) -> Warnings:

@@ -28,21 +28,44 @@ _LARGEST_SIDE = 2**31 - 1
 _LARGEST_CUBE_BYTES = 2**50
 _WHOLE_NUMBER = re.compile(r"[+-]?[0-9]{1,18}")
 _DATA_TYPES = {
-    1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8", 12: "u2", 13: "u4", 14: "i8", 15: "u8",
-}  # fmt: skip
+    1: "u1",
+    2: "i2",
+    3: "i4",
+    4: "f4",
+    5: "f8",
+    12: "u2",
+    13: "u4",
+    14: "i8",
+    15: "u8",
+}
 _COMPLEX_TYPES = (6, 9)
 # Kinds of file that carry an ENVI header, but no plain cube of spectra behind it.
 _OTHER_FILE_TYPES = ("classification", "spectral library", "meta", "virtual", "tiff", "jpeg", "nitf", "hdf")
 # Two lines of one of these that differ leave open what the data mean.
 _TOLD_ONCE = (
-    "samples", "lines", "bands", "data type", "interleave", "byte order", "header offset", "file compression",
-    "wavelength", "wavelength units", "bbl", "reflectance scale factor", "data ignore value", "data gain values",
+    "samples",
+    "lines",
+    "bands",
+    "data type",
+    "interleave",
+    "byte order",
+    "header offset",
+    "file compression",
+    "wavelength",
+    "wavelength units",
+    "bbl",
+    "reflectance scale factor",
+    "data ignore value",
+    "data gain values",
     "data offset values",
-)  # fmt: skip
+)
 # A byte-order mark, or the first letters of a header in UTF-16 without one.
 _UTF16 = {
-    b"\xff\xfe": "utf-16-le", b"\xfe\xff": "utf-16-be", b"E\0N\0": "utf-16-le", b"\0E\0N": "utf-16-be",
-}  # fmt: skip
+    b"\xff\xfe": "utf-16-le",
+    b"\xfe\xff": "utf-16-be",
+    b"E\0N\0": "utf-16-le",
+    b"\0E\0N": "utf-16-be",
+}
 
 
 @dataclass(frozen=True)
@@ -184,7 +207,9 @@ class _Reader:
             text = "The header names no byte order; little endian is assumed."
             warnings = (("byte_order_assumed", text),)
         return EnviHeader(
-            rows, cols, bands,
+            rows,
+            cols,
+            bands,
             dtype=dtype.newbyteorder(">" if self._whole("byte order", 0, 1, default=0) else "<"),
             interleave=interleave,
             offset=self._whole("header offset", 0, _LARGEST_CUBE_BYTES, default=0),
@@ -194,7 +219,7 @@ class _Reader:
             bad_band_list=self._numbers("bbl"),
             declared=self._declared(bands),
             warnings=warnings,
-        )  # fmt: skip
+        )
 
     def _wrong(self, field: str, why: str) -> CubeHeaderError:
         value = self._fields.get(field, "")
@@ -202,8 +227,9 @@ class _Reader:
         return CubeHeaderError(
             f"{self._name}: '{field} = {told}' {why}.",
             advice=f"Correct '{field}' in the header, or export the cube again.",
-            field=field, value=told,
-        )  # fmt: skip
+            field=field,
+            value=told,
+        )
 
     def _required(self, field: str) -> str:
         value = self._fields.get(field, "").partition(";")[0].strip()

@@ -61,8 +61,9 @@ class HdfFormat:
             raise CubeTruncatedError(
                 f"{path.name} holds {sizes[1]} bytes of {sizes[2]}.",
                 advice="Copy the cube again, completely.",
-                expected_bytes=int(sizes[2]), found_bytes=int(sizes[1]),
-            ) from error  # fmt: skip
+                expected_bytes=int(sizes[2]),
+                found_bytes=int(sizes[1]),
+            ) from error
         return describe(
             path,
             "MATLAB 7.3" if reversed_axes else self.name,

@@ -189,5 +189,6 @@ def check_dtype(path: Path, dtype: np.dtype) -> None:
         raise CubeHeaderError(
             f"{path.name} holds values of type {dtype}.",
             advice="Save the cube as integers or real floating-point numbers.",
-            field="dtype", value=str(dtype),
-        )  # fmt: skip
+            field="dtype",
+            value=str(dtype),
+        )

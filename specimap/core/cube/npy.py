@@ -76,8 +76,9 @@ def _mapped(path: Path, header: _NpyHeader, offset: int) -> Array:
         raise CubeTruncatedError(
             f"{path.name} holds {found} bytes, its header asks for {expected}.",
             advice="Copy the cube again, completely.",
-            expected_bytes=expected, found_bytes=found,
-        )  # fmt: skip
+            expected_bytes=expected,
+            found_bytes=found,
+        )
     count = math.prod(header.shape)
     return header.shaped(np.asarray(np.memmap(path, header.dtype, "r", offset=offset, shape=(count,))))
 
@@ -171,8 +172,9 @@ def _member(path: Path, archive: zipfile.ZipFile, name: str, headers: dict[str, 
         raise CubeTruncatedError(
             f"{path.name}: '{name}' holds {info.file_size} bytes, its header asks for {expected}.",
             advice="Save the archive again.",
-            expected_bytes=expected, found_bytes=info.file_size,
-        )  # fmt: skip
+            expected_bytes=expected,
+            found_bytes=info.file_size,
+        )
     if info.compress_type == zipfile.ZIP_STORED:
         with open(path, "rb") as file:
             file.seek(info.header_offset)

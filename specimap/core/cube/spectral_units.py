@@ -17,15 +17,46 @@ _LIGHT_NM_PER_S = 299_792_458e9
 _NM_EV = 1_239.841_984  # Planck's constant times the speed of light
 
 _PREFIXES = {
-    "": 1.0, "p": 1e-12, "n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "d": 1e-1, "k": 1e3, "g": 1e9, "t": 1e12,
-    "pico": 1e-12, "nano": 1e-9, "micro": 1e-6, "milli": 1e-3, "centi": 1e-2, "deci": 1e-1, "kilo": 1e3,
-    "mega": 1e6, "giga": 1e9, "tera": 1e12, "peta": 1e15,
-}  # fmt: skip
+    "": 1.0,
+    "p": 1e-12,
+    "n": 1e-9,
+    "u": 1e-6,
+    "m": 1e-3,
+    "c": 1e-2,
+    "d": 1e-1,
+    "k": 1e3,
+    "g": 1e9,
+    "t": 1e12,
+    "pico": 1e-12,
+    "nano": 1e-9,
+    "micro": 1e-6,
+    "milli": 1e-3,
+    "centi": 1e-2,
+    "deci": 1e-1,
+    "kilo": 1e3,
+    "mega": 1e6,
+    "giga": 1e9,
+    "tera": 1e12,
+    "peta": 1e15,
+}
 _LENGTH = re.compile(r"(p|n|u|m|c|d|k|pico|nano|micro|milli|centi|deci|kilo|)(?:m|met(?:er|re)s?)")
 _OTHER_LENGTHS = {
-    "micron": 1e3, "mu": 1e3, "mic": 1e3, "a": 0.1, "ang": 0.1, "angstrom": 0.1, "angstroem": 0.1, "aa": 0.1,
-    "inch": 25.4e6, "inche": 25.4e6, "in": 25.4e6, "mil": 25.4e3, "foot": 304.8e6, "feet": 304.8e6, "ft": 304.8e6,
-}  # fmt: skip
+    "micron": 1e3,
+    "mu": 1e3,
+    "mic": 1e3,
+    "a": 0.1,
+    "ang": 0.1,
+    "angstrom": 0.1,
+    "angstroem": 0.1,
+    "aa": 0.1,
+    "inch": 25.4e6,
+    "inche": 25.4e6,
+    "in": 25.4e6,
+    "mil": 25.4e3,
+    "foot": 304.8e6,
+    "feet": 304.8e6,
+    "ft": 304.8e6,
+}
 _WAVENUMBER = re.compile(
     r"(?:1/|per|inverse|reciprocal)(?P<inverse>.+)|(?P<power>.+?)(?:\^|\*\*)?[{(]?-1[)}]?|"
     r"(?P<plain>wavenumbers?|kaysers?)"
@@ -34,8 +65,28 @@ _WAVENUMBER = re.compile(
 _FREQUENCY = re.compile(r"(k|m|g|t|p|kilo|mega|giga|tera|peta|)(?:hz|hertz)")
 _ENERGY = re.compile(r"(m|k|milli|kilo|)(?:ev|electron-?volts?)")
 _INDEX = re.compile(r"(?:band|channel|layer|slice)?(?:index|indices|indexes|numbers?|nr|no|id)|bands?|channels?")
-_NONE = {"", "unknown", "none", "n/a", "na", "null", "nil", "unitless", "dimensionless", "undefined", "unspecified",
-         "1", "-", "--", "?", "arbitrary", "nan", "wavelength", "wavelengths", "lambda"}  # fmt: skip
+_NONE = {
+    "",
+    "unknown",
+    "none",
+    "n/a",
+    "na",
+    "null",
+    "nil",
+    "unitless",
+    "dimensionless",
+    "undefined",
+    "unspecified",
+    "1",
+    "-",
+    "--",
+    "?",
+    "arbitrary",
+    "nan",
+    "wavelength",
+    "wavelengths",
+    "lambda",
+}
 
 
 @dataclass(frozen=True)

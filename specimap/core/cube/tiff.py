@@ -39,8 +39,15 @@ _MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _OWN_KINDS = {"shaped", "uniform", "imagej", "volumetric"}
 _ONE_FILE = {f"is_{kind}": False for kind in tifffile.TIFF.FILE_FLAGS - _OWN_KINDS}
 _LOSSLESS = {
-    "NONE", "LZW", "ADOBE_DEFLATE", "DEFLATE", "PACKBITS", "LZMA", "ZSTD", "ZSTD_DEPRECATED",
-}  # fmt: skip
+    "NONE",
+    "LZW",
+    "ADOBE_DEFLATE",
+    "DEFLATE",
+    "PACKBITS",
+    "LZMA",
+    "ZSTD",
+    "ZSTD_DEPRECATED",
+}
 _JPEG = "JPEG"
 _PREDICTORS = {"NONE", "HORIZONTAL", "FLOATINGPOINT"}
 
@@ -75,10 +82,14 @@ class TiffFormat:
         if len(axes) == 2:
             array, axes = array[..., None], (*axes, 2)
         return describe(
-            path, self.name, ArrayPixels(array.transpose(axes)),
-            wavelengths=wavelengths, units=units, declared=declared,
+            path,
+            self.name,
+            ArrayPixels(array.transpose(axes)),
+            wavelengths=wavelengths,
+            units=units,
+            declared=declared,
             warnings=packing + _about_others(file, series) + about_axes,
-        )  # fmt: skip
+        )
 
 
 @contextmanager
@@ -169,8 +180,9 @@ def _axes(path: Path, series: tifffile.TiffPageSeries, count: int | None) -> tup
         raise CubeFormatError(
             f"{path.name} holds images of shape {shape} with axes {names} ({sides}), not a cube.",
             advice="Save one page for each band, or one page with a sample for each band.",
-            shape=list(shape), axes=names,
-        )  # fmt: skip
+            shape=list(shape),
+            axes=names,
+        )
     if len(shape) == 2:
         return (names.index("Y"), names.index("X")), ()
     cube = Variable(path.name, shape, series.dtype, tuple(n.lower() if n in "YX" else "band" for n in names))

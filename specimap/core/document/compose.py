@@ -24,8 +24,11 @@ from specimap.core.evidence.truth import Judged
 from specimap.core.report import LeaveOneOut, MethodFigures, Report
 
 STAGE_NAMES = {
-    "reconstruct": "1 reconstruct", "adjust": "2 bundle-adjust", "render": "3 render", "register": "4 register",
-}  # fmt: skip
+    "reconstruct": "1 reconstruct",
+    "adjust": "2 bundle-adjust",
+    "render": "3 render",
+    "register": "4 register",
+}
 _HASH = 24
 _VALUE = 120
 _KINDS = {
@@ -102,8 +105,9 @@ def _figures(report: Report) -> Iterator[Block]:
         (0.36, *(0.47 / max(len(names), 1) for _ in names), 0.17),
         numeric=tuple(range(1, len(names) + 2)),
     )
-    yield Table("What they can and cannot say", ("Figure", "What it says", "What it cannot say"), MEANINGS,
-                (0.24, 0.4, 0.36))  # fmt: skip
+    yield Table(
+        "What they can and cannot say", ("Figure", "What it says", "What it cannot say"), MEANINGS, (0.24, 0.4, 0.36)
+    )
 
 
 def _corner_2d(figures: MethodFigures) -> str:
@@ -135,27 +139,38 @@ def _run(report: Report) -> Iterator[Block]:
         kept = "taken from an earlier run" if stage in report.reused_stages else ""
         rows.append((STAGE_NAMES.get(stage, stage), f"{seconds:.1f}", _published_seconds(stage), kept))
     yield Table(
-        "Seconds per stage; the published ones on one A100 GPU", ("Stage", "Seconds", "Published", ""), tuple(rows),
-        (0.35, 0.15, 0.2, 0.3), numeric=(1, 2),
-    )  # fmt: skip
+        "Seconds per stage; the published ones on one A100 GPU",
+        ("Stage", "Seconds", "Published", ""),
+        tuple(rows),
+        (0.35, 0.15, 0.2, 0.3),
+        numeric=(1, 2),
+    )
     camera = report.cube_camera
     yield Bullets(
         (
             ("Program", f"Specimap {report.specimap_version}"),
             ("Method, backend, adjustment", f"{report.method}, {report.backend}, {report.adjustment}"),
             ("Markers in the photos", ", ".join(map(str, report.marker_ids))),
-            ("Markers in the cube", f"{', '.join(map(str, report.marker_ids_in_cube))}; found in the "
-             f"{camera.markers_found_in}"),
+            (
+                "Markers in the cube",
+                f"{', '.join(map(str, report.marker_ids_in_cube))}; found in the {camera.markers_found_in}",
+            ),
             ("Photos' focal length", f"{report.photo_focal_px:.1f} px"),
-            ("Cube's camera", f"{camera.distance_mm:.0f} mm above the markers, focal length {camera.focal_px:.0f} px "
-             f"± {100 * camera.focal_relative_sd:.0f} %, corners {camera.reprojection_rms_px:.3f} px RMS, roll "
-             f"{camera.roll_deg:.1f} degrees{', mirrored' if camera.mirrored else ''}; {_KINDS[camera.model]}, pixels "
-             f"{camera.pixel_aspect:.3f} times as high as wide"),
-            ("RANSAC of the homography", f"{report.inliers.n} of {report.inliers.of} corners within "
-             f"{report.inliers.threshold_px:g} px of the coarse grid, {report.inliers.threshold_mm:g} mm"),
+            (
+                "Cube's camera",
+                f"{camera.distance_mm:.0f} mm above the markers, focal length {camera.focal_px:.0f} px "
+                f"± {100 * camera.focal_relative_sd:.0f} %, corners {camera.reprojection_rms_px:.3f} px RMS, roll "
+                f"{camera.roll_deg:.1f} degrees{', mirrored' if camera.mirrored else ''}; {_KINDS[camera.model]}, "
+                f"pixels {camera.pixel_aspect:.3f} times as high as wide",
+            ),
+            (
+                "RANSAC of the homography",
+                f"{report.inliers.n} of {report.inliers.of} corners within "
+                f"{report.inliers.threshold_px:g} px of the coarse grid, {report.inliers.threshold_mm:g} mm",
+            ),
             ("Points", f"{report.coverage.points:,}, of which on the specimen {report.coverage.specimen_points:,}"),
         )
-    )  # fmt: skip
+    )
     flat = tuple((name, _short(value)) for name, value in flattened(report.settings))
     if flat:
         yield Table("Settings", ("Setting", "Value"), flat, (0.5, 0.5))

@@ -43,9 +43,12 @@ def photo_blocks(material: Material) -> Iterator[Block]:
         for k, photo in enumerate(photos, start=1)
     )
     yield Table(
-        "Used photos; sizes as worked with", ("No.", "Photo", "Size, px", "Markers", "RMS, px"), rows,
-        (0.08, 0.34, 0.16, 0.3, 0.12), numeric=(0, 4),
-    )  # fmt: skip
+        "Used photos; sizes as worked with",
+        ("No.", "Photo", "Size, px", "Markers", "RMS, px"),
+        rows,
+        (0.08, 0.34, 0.16, 0.3, 0.12),
+        numeric=(0, 4),
+    )
 
 
 def corner_blocks(material: Material) -> Iterator[Block]:
@@ -120,11 +123,10 @@ def surface_blocks(material: Material) -> Iterator[Block]:
     yield Picture(
         lambda: result_figures.draw_above(material.above, material.preview),
         "map",
-        "The specimen from above in the colours of the photos" + (
-            ", and in false colours made of its spectra." if material.preview is not None else "."
-        ),
+        "The specimen from above in the colours of the photos"
+        + (", and in false colours made of its spectra." if material.preview is not None else "."),
         "Straight from above, in the marker frame: x to the right, y up.",
-    )  # fmt: skip
+    )
     yield Picture(
         lambda: result_figures.draw_height(material.above),
         "map",

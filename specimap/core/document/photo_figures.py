@@ -56,9 +56,7 @@ def photos_a_sheet(photo: PhotoCorners) -> int:
     return COLUMNS * max(1, int(PAGE_IN / (wide * (photo.height_px / photo.width_px + 0.15))))
 
 
-def draw_photos(
-    photos: Sequence[PhotoCorners], tiles: Sequence[Bytes], first: int, factor: float
-) -> Figure:
+def draw_photos(photos: Sequence[PhotoCorners], tiles: Sequence[Bytes], first: int, factor: float) -> Figure:
     """Photos with their markers outlined and residuals as arrows, ``factor`` times too long; numbers from ``first``.
 
     Without ``tiles`` the outlines stand on grey.
@@ -179,6 +177,18 @@ def _rms(photo: PhotoCorners) -> float:
 def _arrows(ax: Axes, starts: Floats, arrows: Floats) -> None:
     if len(starts):
         ax.quiver(
-            starts[:, 0], starts[:, 1], arrows[:, 0], arrows[:, 1], angles="xy", scale_units="xy", scale=1,
-            color=p.VERMILION, width=0.0022, headwidth=3.4, headlength=4, headaxislength=3.6, minlength=0.3, zorder=5,
-        )  # fmt: skip
+            starts[:, 0],
+            starts[:, 1],
+            arrows[:, 0],
+            arrows[:, 1],
+            angles="xy",
+            scale_units="xy",
+            scale=1,
+            color=p.VERMILION,
+            width=0.0022,
+            headwidth=3.4,
+            headlength=4,
+            headaxislength=3.6,
+            minlength=0.3,
+            zorder=5,
+        )

@@ -46,9 +46,14 @@ def write_pdf(document: Document, target: Path, progress: Callable[[float], None
     frame = Frame(margin, margin, A4[0] - 2 * margin, A4[1] - 2 * margin, 0, 0, 0, 0)
     out = io.BytesIO()
     made = BaseDocTemplate(
-        out, pagesize=A4, title=f"{document.title}: {document.subtitle}", author="Specimap", invariant=1, lang="en",
+        out,
+        pagesize=A4,
+        title=f"{document.title}: {document.subtitle}",
+        author="Specimap",
+        invariant=1,
+        lang="en",
         pageTemplates=[PageTemplate(frames=[frame], onPage=lambda canvas, _: _foot(canvas, document, margin, A4))],
-    )  # fmt: skip
+    )
     made.build(list(_story(document, frame._width, progress)))
     with atomic_path(target) as aside:
         aside.write_bytes(out.getvalue())
@@ -74,9 +79,15 @@ def _style(size: float, *, bold: bool = False, colour: str = "#1b1b1b", before: 
     from reportlab.lib.styles import ParagraphStyle
 
     return ParagraphStyle(
-        f"{size}{bold}{colour}{before}{after}", fontName=BOLD if bold else SANS, fontSize=size, leading=size * 1.38,
-        textColor=HexColor(colour), spaceBefore=before, spaceAfter=after, splitLongWords=1,
-    )  # fmt: skip
+        f"{size}{bold}{colour}{before}{after}",
+        fontName=BOLD if bold else SANS,
+        fontSize=size,
+        leading=size * 1.38,
+        textColor=HexColor(colour),
+        spaceBefore=before,
+        spaceAfter=after,
+        splitLongWords=1,
+    )
 
 
 def _text(text: str, style: Any, label: str = "") -> Any:
@@ -134,8 +145,10 @@ def _flowables(block: Bullets | Callout | Table, width: float) -> Iterator[Any]:
         yield _callout(block, width)
         yield Spacer(1, 7)
     elif isinstance(block, Bullets):
-        rows = [[_text(term, _style(8.5, colour="#5a5a5a", after=0)), _text(said, _style(8.5, after=0))]
-                for term, said in block.items]  # fmt: skip
+        rows = [
+            [_text(term, _style(8.5, colour="#5a5a5a", after=0)), _text(said, _style(8.5, after=0))]
+            for term, said in block.items
+        ]
         yield _grid(rows, [0.3 * width, 0.7 * width], [])
         yield Spacer(1, 6)
     else:
@@ -174,8 +187,10 @@ def _table(block: Table, width: float) -> Iterator[Any]:
             return _text(text, _style(8, bold=True, colour="#8f3900", after=0))
         return _text(text, right.get(column, plain))
 
-    head = [_text(text, (_style(8, bold=True, after=0)).clone("head", alignment=2 if c in block.numeric else 0))
-            for c, text in enumerate(block.head)]  # fmt: skip
+    head = [
+        _text(text, (_style(8, bold=True, after=0)).clone("head", alignment=2 if c in block.numeric else 0))
+        for c, text in enumerate(block.head)
+    ]
     marks = block.marks or ("",) * len(block.rows)
     rows = [[cell(text, c, mark) for c, text in enumerate(row)] for row, mark in zip(block.rows, marks, strict=True)]
     total = sum(block.widths)

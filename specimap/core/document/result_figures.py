@@ -116,9 +116,12 @@ def draw_sigma(cloud: Cloud, frame: CubeFrame) -> Figure:
     figure, ax = _in_cube(frame, "Stated standard deviation of the position")
     chosen = cloud.sigma_mm[on_specimen(cloud)]
     shown = ax.imshow(
-        frame.mean(cloud.sigma_mm), cmap=p.colour_map(p.ERRORS), vmin=0, vmax=p.limits(chosen, (0, 98))[1],
+        frame.mean(cloud.sigma_mm),
+        cmap=p.colour_map(p.ERRORS),
+        vmin=0,
+        vmax=p.limits(chosen, (0, 98))[1],
         interpolation="nearest",
-    )  # fmt: skip
+    )
     p.scale_bar(ax, 1 / frame.mm_per_px, frame.cols)
     p.colour_bar(figure, ax, shown, "sigma, mm", extend="max")
     return figure
@@ -145,9 +148,12 @@ def draw_error_map(errors: Judged, frame: CubeFrame) -> Figure:
     """The distance of each point of the specimen from where its pixel truly looked."""
     figure, ax = _in_cube(frame, "Error of the position against truth")
     shown = ax.imshow(
-        frame.mean(errors.errors_mm, errors.points), cmap=p.colour_map(p.ERRORS), vmin=0,
-        vmax=p.limits(errors.errors_mm, (0, 98))[1], interpolation="nearest",
-    )  # fmt: skip
+        frame.mean(errors.errors_mm, errors.points),
+        cmap=p.colour_map(p.ERRORS),
+        vmin=0,
+        vmax=p.limits(errors.errors_mm, (0, 98))[1],
+        interpolation="nearest",
+    )
     p.scale_bar(ax, 1 / frame.mm_per_px, frame.cols)
     p.colour_bar(figure, ax, shown, "error, mm", extend="max")
     return figure
@@ -167,8 +173,14 @@ def draw_reliability(errors: Judged) -> Figure:
     k = np.linspace(0, 4, 81)
     p.styled(within, title="Are the stated sigmas right?", x="k", y="share of errors within k sigma")
     within.plot(k, [errors.within(v) for v in k.tolist()], color=p.BLUE, linewidth=1.8, label="this run")
-    within.plot(*zip(*NORMAL_WITHIN, strict=True), color=p.VERMILION, marker="o", markersize=5, linestyle="none",
-                label="normal distribution")  # fmt: skip
+    within.plot(
+        *zip(*NORMAL_WITHIN, strict=True),
+        color=p.VERMILION,
+        marker="o",
+        markersize=5,
+        linestyle="none",
+        label="normal distribution",
+    )
     within.set_xlim(0, 4)
     within.set_ylim(0, 1.02)
     p.legend(within, place="lower right")
@@ -198,5 +210,14 @@ def _classes(
     occurring = np.bincount(found.ravel(), minlength=len(colours)) > 0
     for there, colour, name in zip(occurring, colours, names, strict=True):
         if there:
-            ax.plot([], [], marker="s", linestyle="none", markersize=7, color=colour, label=name,
-                    markeredgecolor=p.MUTED, markeredgewidth=0.4)  # fmt: skip
+            ax.plot(
+                [],
+                [],
+                marker="s",
+                linestyle="none",
+                markersize=7,
+                color=colour,
+                label=name,
+                markeredgecolor=p.MUTED,
+                markeredgewidth=0.4,
+            )

@@ -90,9 +90,15 @@ REFUSALS = {
     "photo_unlocated": "Take it again with two or more markers in view, between its neighbours.",
 }
 GRAVE = (
-    "specimen_moved", "cube_camera_loose", "cube_camera_unfit", "scale_implausible", "scale_contradicts_exif",
-    "specimen_not_found", "corners_scatter", "cube_corners_scatter",
-)  # fmt: skip
+    "specimen_moved",
+    "cube_camera_loose",
+    "cube_camera_unfit",
+    "scale_implausible",
+    "scale_contradicts_exif",
+    "specimen_not_found",
+    "corners_scatter",
+    "cube_corners_scatter",
+)
 """Warnings that put all places in doubt."""
 UNKNOWN_REFUSAL = "Take it again from the same side with the markers in view."
 
@@ -164,7 +170,8 @@ def checks(report: Report) -> list[Check]:
             f"{len(in_cube)} of {len(in_photos)}",
             "4 or more" if of_a_board else "all that the photos show",
             len(in_cube) >= 4 if of_a_board else not missing,
-            "Record the cube again with four or more markers in view, lit and uncovered." if of_a_board
+            "Record the cube again with four or more markers in view, lit and uncovered."
+            if of_a_board
             else f"Record the cube again with marker {_listed([str(i) for i in missing])} in view, lit and uncovered.",
         ),
         Check(
@@ -172,7 +179,8 @@ def checks(report: Report) -> list[Check]:
             f"{rms:.2f} px" + (f"; {len(off)} photo{'s' * (len(off) != 1)} off" if off else ""),
             f"{corner_limit_px(report):.1f} px or less, no photo far off",
             rms <= corner_limit_px(report) and not off,
-            f"Look at {_listed([o.name for o in off])}: a card moved in between, or it is of another lens." if off
+            f"Look at {_listed([o.name for o in off])}: a card moved in between, or it is of another lens."
+            if off
             else "Take all photos again with one lens, touching neither markers nor specimen in between.",
         ),
         Check(
@@ -187,7 +195,8 @@ def checks(report: Report) -> list[Check]:
             "too few markers to tell" if left is None else f"{left.median:.3f} mm, largest {left.maximum:.3f} mm",
             f"median below {LIMIT_MM:g} mm",
             left is not None and left.median < LIMIT_MM,
-            "Show three or more markers in the cube." if left is None
+            "Show three or more markers in the cube."
+            if left is None
             else "Something moved between photos and cube, or the marker's edge is wrong: check both and repeat.",
         ),
         Check(
@@ -197,7 +206,7 @@ def checks(report: Report) -> list[Check]:
             covered > LEAST_COVERAGE,
             "Take more photos from the side that is missing in the coverage map.",
         ),
-    ]  # fmt: skip
+    ]
 
 
 @dataclass(frozen=True)

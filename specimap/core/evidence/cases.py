@@ -55,8 +55,5 @@ def cases(seeds: tuple[int, ...], acquisitions: tuple[Path, ...], *, quick: bool
     for capture in captures:
         if not capture.has_truth:
             raise NotFoundError(f"{capture.folder} holds no truth.npz.", advice="Only what has truth can validate.")
-    phantoms = [
-        Case(name, seed, replace(base, seed=seed, **DEFECTS[name]))
-        for name in names for seed in seeds
-    ]  # fmt: skip
+    phantoms = [Case(name, seed, replace(base, seed=seed, **DEFECTS[name])) for name in names for seed in seeds]
     return [*phantoms, *(Case(capture.name, None, capture=capture) for capture in captures)]

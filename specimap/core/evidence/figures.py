@@ -33,9 +33,17 @@ def study_2d(study: Study) -> Figure:
     _series(ax, study, lambda f: f.corner_2d_mm.mean, BLUE, "o", "this method")
     for k, (mean, sd) in enumerate(published.CORNER_2D_MM):
         ax.errorbar(
-            100 - 0.8 * (k + 1), mean, yerr=sd, color=VERMILION, marker="D", markersize=4, linewidth=1, capsize=2,
-            linestyle="none", label=f"{published.REFERENCE}, two specimens, mean ± sd" if k == 0 else None,
-        )  # fmt: skip
+            100 - 0.8 * (k + 1),
+            mean,
+            yerr=sd,
+            color=VERMILION,
+            marker="D",
+            markersize=4,
+            linewidth=1,
+            capsize=2,
+            linestyle="none",
+            label=f"{published.REFERENCE}, two specimens, mean ± sd" if k == 0 else None,
+        )
     ax.set_ylim(bottom=0)
     _legend_below(drawn, ax)
     return drawn
@@ -51,15 +59,26 @@ def study_3d(study: Study) -> Figure:
     _series(ax, study, lambda f: f.truth.median_mm if f.truth else None, GREEN, "s", "true error, median")
     _series(ax, study, lambda f: f.truth.p95_mm if f.truth else None, GREEN, "^", "true error, 95th percentile")
     ax.plot(
-        [99.2, 98.4], published.CORNER_3D_MM, color=VERMILION, marker="D", markersize=4, linestyle="none",
+        [99.2, 98.4],
+        published.CORNER_3D_MM,
+        color=VERMILION,
+        marker="D",
+        markersize=4,
+        linestyle="none",
         label=f"{published.REFERENCE}: 3D corner error, median",
-    )  # fmt: skip
+    )
     lowest = min((row.share for row in study.rows), default=50)
     ax.plot(
-        [published.DROPPED_SHARE, min(lowest, published.DROPPED_SHARE - 2)], [published.DROPPED_3D_MM] * 2,
-        color=VERMILION, linewidth=1.2, linestyle="--", marker="^", markersize=5, markevery=[0],
+        [published.DROPPED_SHARE, min(lowest, published.DROPPED_SHARE - 2)],
+        [published.DROPPED_3D_MM] * 2,
+        color=VERMILION,
+        linewidth=1.2,
+        linestyle="--",
+        marker="^",
+        markersize=5,
+        markevery=[0],
         label=f"{published.REFERENCE}: above {published.DROPPED_3D_MM:g} mm from {published.DROPPED_SHARE} % on",
-    )  # fmt: skip
+    )
     _legend_below(drawn, ax)
     return drawn
 
@@ -73,9 +92,16 @@ def _share_axes(drawn: Figure, study: Study, title: str, y: str) -> Axes:
     for share in refused:
         count = sum(row.share == share and row.outcome.figures is None for row in study.rows)
         ax.text(
-            share, 0.02, f"{count} refused", transform=ax.get_xaxis_transform(), ha="center", fontsize=SMALL_PT,
-            color=MUTED, rotation=90, va="bottom",
-        )  # fmt: skip
+            share,
+            0.02,
+            f"{count} refused",
+            transform=ax.get_xaxis_transform(),
+            ha="center",
+            fontsize=SMALL_PT,
+            color=MUTED,
+            rotation=90,
+            va="bottom",
+        )
     return ax
 
 
@@ -157,8 +183,11 @@ def validation_sigma(validation: v.Validation) -> Figure:
     """Share of the true errors within one and two stated standard deviations."""
     names = _names(validation.rows)
     drawn = figure(height_in=1.7 + 0.3 * len(names))
-    ax = styled(drawn.add_subplot(), title="Stated standard deviation against true errors (default form)",
-                x="% of the specimen's points")  # fmt: skip
+    ax = styled(
+        drawn.add_subplot(),
+        title="Stated standard deviation against true errors (default form)",
+        x="% of the specimen's points",
+    )
     for sigmas, colour in ((1, BLUE), (2, GREEN)):
         ax.axvline(_NORMAL[sigmas], color=colour, linewidth=1, linestyle="--")
         label: str | None = f"within {sigmas} sigma (dashed: normal distribution, {_NORMAL[sigmas]:.0f} %)"
@@ -195,9 +224,7 @@ def _logarithmic(ax: Axes) -> None:
 
 def _legend_below(drawn: Figure, ax: Axes) -> None:
     handles, labels = ax.get_legend_handles_labels()
-    drawn.legend(
-        handles, labels, loc="outside lower center", ncols=2, fontsize=SMALL_PT, frameon=False, labelcolor=INK
-    )
+    drawn.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=SMALL_PT, frameon=False, labelcolor=INK)
 
 
 def _names(rows: Sequence[v.Row]) -> list[str]:

@@ -28,9 +28,16 @@ from specimap.core.pipeline.clock import Progress
 from specimap.core.report import Quartiles, Report, Section, Spread
 
 REFUSED = (
-    TooFewPhotosError, PhotosNotConnectedError, DepthNotFoundError, NoMarkersFoundError, DuplicateMarkersError,
-    MarkersMissingInCubeError, MarkerGeometryError, RegistrationError, PhotoUnreadableError,
-)  # fmt: skip
+    TooFewPhotosError,
+    PhotosNotConnectedError,
+    DepthNotFoundError,
+    NoMarkersFoundError,
+    DuplicateMarkersError,
+    MarkersMissingInCubeError,
+    MarkerGeometryError,
+    RegistrationError,
+    PhotoUnreadableError,
+)
 """What photos or cube are refused for; anything else (a full disk, a stop) ends the whole study."""
 STAGE_SHARES = {"reconstruct": 0.5, "adjust": 0.4, "render": 0.02, "register": 0.08}
 
@@ -114,9 +121,13 @@ def _against(out: Path, truth: Path) -> AgainstTruth:
     judged = judge_with_sigma(out, truth)
     errors = judged.errors
     return AgainstTruth(
-        median_mm=errors.median, p95_mm=errors.p95, coverage=errors.coverage, scale=errors.scale,
-        within_1_sigma=judged.within(1), within_2_sigma=judged.within(2),
-    )  # fmt: skip
+        median_mm=errors.median,
+        p95_mm=errors.p95,
+        coverage=errors.coverage,
+        scale=errors.scale,
+        within_1_sigma=judged.within(1),
+        within_2_sigma=judged.within(2),
+    )
 
 
 def _as_one(progress: Callable[[float], None]) -> Progress:
@@ -150,5 +161,3 @@ def scratch_in(folder: Path) -> Iterator[Path]:
         yield aside
     finally:
         remove(aside)
-
-

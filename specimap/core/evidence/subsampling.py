@@ -96,10 +96,15 @@ def study_subsampling(
 
     def keep() -> Study:
         study = Study(
-            specimap_version=__version__, acquisition=capture.name, key=key, photos=len(capture.photos),
-            has_truth=capture.has_truth, method=settings.register.method, adjustment=settings.adjust.form,
+            specimap_version=__version__,
+            acquisition=capture.name,
+            key=key,
+            photos=len(capture.photos),
+            has_truth=capture.has_truth,
+            method=settings.register.method,
+            adjustment=settings.adjust.form,
             rows=[rows[place] for place in sorted(rows, key=lambda place: (-place[0], place[1]))],
-        )  # fmt: skip
+        )
         write_text(target, study.model_dump_json(indent=1))
         return study
 
@@ -131,9 +136,13 @@ def _run(
         for photo in chosen:
             (photos / photo.name).symlink_to(photo.resolve())
         outcome = run_and_judge(
-            Inputs(photos, capture.cube), aside / "out", settings, capture.folder if capture.has_truth else None,
-            progress=progress, cancelled=cancelled,
-        )  # fmt: skip
+            Inputs(photos, capture.cube),
+            aside / "out",
+            settings,
+            capture.folder if capture.has_truth else None,
+            progress=progress,
+            cancelled=cancelled,
+        )
     return Row(share=share, seed=seed, photos=len(chosen), outcome=outcome)
 
 

@@ -34,9 +34,15 @@ class Table:
 # ---- subsampling --------------------------------------------------------------------------------------
 
 STUDY_HEADINGS = (
-    "share of photos", "seed", "photos used", "2D corner mm", "3D corner mm", "true error mm: median, p95", "coverage",
+    "share of photos",
+    "seed",
+    "photos used",
+    "2D corner mm",
+    "3D corner mm",
+    "true error mm: median, p95",
+    "coverage",
     "seconds",
-)  # fmt: skip
+)
 
 
 def study_cells(row: StudyRow) -> tuple[str, ...]:
@@ -48,11 +54,14 @@ def study_cells(row: StudyRow) -> tuple[str, ...]:
         return (*start, f"0 of {row.photos}", code, *(NOTHING,) * 4)
     true = found.truth
     return (
-        *start, f"{found.photos_used} of {row.photos}",
-        f"{found.corner_2d_mm.mean:.3f} ± {found.corner_2d_mm.std:.3f}", _median(found),
+        *start,
+        f"{found.photos_used} of {row.photos}",
+        f"{found.corner_2d_mm.mean:.3f} ± {found.corner_2d_mm.std:.3f}",
+        _median(found),
         f"{true.median_mm:.3f}, {true.p95_mm:.2f}" if true else NOTHING,
-        f"{100 * true.coverage:.1f} %" if true else NOTHING, f"{found.seconds:.1f}",
-    )  # fmt: skip
+        f"{100 * true.coverage:.1f} %" if true else NOTHING,
+        f"{found.seconds:.1f}",
+    )
 
 
 def study_table(rows: Sequence[StudyRow]) -> Table:
@@ -68,10 +77,18 @@ def _median(found: Figures) -> str:
 # ---- validation ---------------------------------------------------------------------------------------
 
 VALIDATION_HEADINGS = (
-    "acquisition", "registration, adjustment", "2D corner mm: mean ± sd", "3D corner mm: median (quartiles)",
-    "left-out marker mm", "true error mm: median", "true error mm: p95", "scale", "coverage", "within 1, 2 sigma",
+    "acquisition",
+    "registration, adjustment",
+    "2D corner mm: mean ± sd",
+    "3D corner mm: median (quartiles)",
+    "left-out marker mm",
+    "true error mm: median",
+    "true error mm: p95",
+    "scale",
+    "coverage",
+    "within 1, 2 sigma",
     "warnings",
-)  # fmt: skip
+)
 
 
 def pooled_cells(name: str, rows: Sequence[v.Row]) -> tuple[str, ...]:
@@ -92,15 +109,18 @@ def pooled_cells(name: str, rows: Sequence[v.Row]) -> tuple[str, ...]:
     three = [np.median([getattr(d, k) for d in deep]) for k in ("median", "q1", "q3")] if deep else []
     scale = max((t.scale for t in truth), key=abs, default=float("nan"))
     return (
-        label, f"{method}, {form}", f"{means.mean():.3f} ± {spread:.3f}",
+        label,
+        f"{method}, {form}",
+        f"{means.mean():.3f} ± {spread:.3f}",
         f"{three[0]:.3f} ({three[1]:.3f}-{three[2]:.3f})" if deep else NOTHING,
         f"{np.median(left_out):.3f}" if left_out else NOTHING,
-        _with_worst([t.median_mm for t in truth], 3), _with_worst([t.p95_mm for t in truth], 2),
+        _with_worst([t.median_mm for t in truth], 3),
+        _with_worst([t.p95_mm for t in truth], 2),
         f"{100 * scale:+.2f} %" if truth else NOTHING,
         f"{100 * min(t.coverage for t in truth):.1f} %" if truth else NOTHING,
         f"{_percent([t.within_1_sigma for t in truth])}, {_percent([t.within_2_sigma for t in truth])}",
         _warnings(found),
-    )  # fmt: skip
+    )
 
 
 def _warnings(found: Sequence[Figures]) -> str:
@@ -130,14 +150,16 @@ def validation_tables(validation: v.Validation) -> list[Table]:
     defects = list(dict.fromkeys(row.defect for row in validation.rows))
     by_case = [
         pooled_cells(defect, chosen)
-        for defect in defects for variant in (v.OURS, v.AS_PUBLISHED)
+        for defect in defects
+        for variant in (v.OURS, v.AS_PUBLISHED)
         if (chosen := _of(validation.rows, variant, defect))
-    ]  # fmt: skip
+    ]
     still = [row for row in validation.rows if row.defect != MOVED]
     whole = [
         pooled_cells(f"{len(chosen)} where nothing moved", chosen)
-        for variant in v.VARIANTS if (chosen := _of(still, variant))
-    ]  # fmt: skip
+        for variant in v.VARIANTS
+        if (chosen := _of(still, variant))
+    ]
     return [
         Table("By acquisition", VALIDATION_HEADINGS, (_published_cells(), *by_case)),
         Table("By form of the method", VALIDATION_HEADINGS, tuple(whole)),

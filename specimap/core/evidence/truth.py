@@ -78,7 +78,11 @@ def judge_with_sigma(out: Path, folder: Path) -> Judged:
     finite = np.isfinite(xyz).all(1) & np.isfinite(true_xyz[pixels[:, 0], pixels[:, 1]]).all(1)
     points = np.flatnonzero(finite & (truth.hsi_class[pixels[:, 0], pixels[:, 1]] == SPECIMEN))
     errors = compare_with_truth(
-        pixels[points], xyz[points], np.array([corners[str(truth.marker_ids[k])] for k in both]),
-        truth.marker_corners[both], true_xyz, truth.hsi_class == SPECIMEN,
-    )  # fmt: skip
+        pixels[points],
+        xyz[points],
+        np.array([corners[str(truth.marker_ids[k])] for k in both]),
+        truth.marker_corners[both],
+        true_xyz,
+        truth.hsi_class == SPECIMEN,
+    )
     return Judged(errors, points, cloud.sigma_mm[points])

@@ -31,8 +31,11 @@ FILE = "validation.json"
 MARK = "validation"
 """Name of the place in the documentation that takes the tables."""
 VARIANTS: tuple[tuple[Method, Form], ...] = (
-    ("camera", "rigid"), ("homography", "rigid"), ("camera", "free"), ("homography", "free"),
-)  # fmt: skip
+    ("camera", "rigid"),
+    ("homography", "rigid"),
+    ("camera", "free"),
+    ("homography", "free"),
+)
 """Registration and adjustment. The order matters: two that share an adjustment share stages 1 to 3."""
 OURS, AS_PUBLISHED = VARIANTS[0], VARIANTS[3]
 _MAKING = 0.3
@@ -125,10 +128,13 @@ def _runs(
             )
             share = (1 - _MAKING) / len(VARIANTS)
             outcome = run_and_judge(
-                Inputs(capture.photos[0].parent, capture.cube), aside / "out", settings, capture.folder,
+                Inputs(capture.photos[0].parent, capture.cube),
+                aside / "out",
+                settings,
+                capture.folder,
                 progress=within(progress, _MAKING + number * share, _MAKING + (number + 1) * share),
                 cancelled=cancelled,
-            )  # fmt: skip
+            )
             rows.append(
                 Row(defect=case.defect, seed=case.seed, method=method, adjustment=form, key=key, outcome=outcome)
             )

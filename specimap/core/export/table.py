@@ -13,9 +13,20 @@ from specimap.core.files import atomic_path
 
 _BLOCK = 2048
 _COLUMNS = (
-    "x_mm", "y_mm", "z_mm", "normal_x", "normal_y", "normal_z", "red", "green", "blue", "sigma_mm", "flags",
-    "hsi_row", "hsi_col",
-)  # fmt: skip
+    "x_mm",
+    "y_mm",
+    "z_mm",
+    "normal_x",
+    "normal_y",
+    "normal_z",
+    "red",
+    "green",
+    "blue",
+    "sigma_mm",
+    "flags",
+    "hsi_row",
+    "hsi_col",
+)
 _LINE = "%.4f,%.4f,%.4f,%.4f,%.4f,%.4f,%d,%d,%d,%.4f,%d,%d,%d"
 
 
@@ -59,7 +70,11 @@ def _texts(cloud: Cloud) -> NDArray[np.bytes_]:
 
 def _rows(cloud: Cloud, part: slice) -> zip[tuple[float, ...]]:
     columns = [
-        *cloud.xyz[part].T, *cloud.normal[part].T, *cloud.rgb[part].T, cloud.sigma_mm[part], cloud.flags[part],
+        *cloud.xyz[part].T,
+        *cloud.normal[part].T,
+        *cloud.rgb[part].T,
+        cloud.sigma_mm[part],
+        cloud.flags[part],
         *cloud.hsi_pixel[part].T,
-    ]  # fmt: skip
+    ]
     return zip(*(column.tolist() for column in columns), strict=True)

@@ -51,9 +51,12 @@ def judge_part(path: Path, claimed: str, expected_bytes: int | None) -> Verdict:
         return Verdict(facts={"part": "whole", "suffix": ".npz"})
     if claimed in CLAIMED_WHOLE:
         return Verdict(
-            "refused", CubeFormatError.code, f"It is no {claimed} file, though its name says so.",
-            "Copy or export the cube again.", {"part": "whole", "suffix": ".bin"},
-        )  # fmt: skip
+            "refused",
+            CubeFormatError.code,
+            f"It is no {claimed} file, though its name says so.",
+            "Copy or export the cube again.",
+            {"part": "whole", "suffix": ".bin"},
+        )
     return Verdict(facts={"part": "data", "suffix": ".raw"})
 
 
@@ -76,9 +79,14 @@ def judge_cube(path: Path) -> Verdict:
         reason = f"Its values do not read ({type(error).__name__})."
         return Verdict("refused", CubeFormatError.code, reason, "Copy or export the cube again.")
     facts = {
-        "rows": cube.rows, "cols": cube.cols, "bands": cube.bands, "dtype": str(cube.dtype), "quantity": cube.quantity,
-        "wavelength_nm": _range(cube.wavelengths_nm), "warnings": _listed(warnings),
-    }  # fmt: skip
+        "rows": cube.rows,
+        "cols": cube.cols,
+        "bands": cube.bands,
+        "dtype": str(cube.dtype),
+        "quantity": cube.quantity,
+        "wavelength_nm": _range(cube.wavelengths_nm),
+        "warnings": _listed(warnings),
+    }
     return Verdict(facts=facts)
 
 
@@ -111,10 +119,15 @@ def _header_facts(header: EnviHeader) -> dict[str, Any]:
     wavelengths, about = nanometres(header.wavelengths, header.wavelength_units, header.bands)
     _, about_bands = bad_band_mask(header.bad_band_list, header.bands)
     return {
-        "rows": header.rows, "cols": header.cols, "bands": header.bands, "interleave": header.interleave,
-        "dtype": str(header.dtype), "expected_bytes": None if header.compressed else header.data_bytes,
-        "wavelength_nm": _range(wavelengths), "warnings": _listed(header.warnings + about + about_bands),
-    }  # fmt: skip
+        "rows": header.rows,
+        "cols": header.cols,
+        "bands": header.bands,
+        "interleave": header.interleave,
+        "dtype": str(header.dtype),
+        "expected_bytes": None if header.compressed else header.data_bytes,
+        "wavelength_nm": _range(wavelengths),
+        "warnings": _listed(header.warnings + about + about_bands),
+    }
 
 
 def _range(wavelengths: Floats) -> list[float] | None:

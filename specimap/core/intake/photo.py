@@ -56,8 +56,13 @@ def judge_photo(path: Path, dictionary: str, others: Others) -> Verdict:
     ``dictionary_seen`` where its markers are of another one.
     """
     facts: dict[str, Any] = {
-        "suffix": ".bin", "width": None, "height": None, "sharpness": None, "marker_ids": [], "dictionary_seen": None,
-    }  # fmt: skip
+        "suffix": ".bin",
+        "width": None,
+        "height": None,
+        "sharpness": None,
+        "marker_ids": [],
+        "dictionary_seen": None,
+    }
     try:
         facts["suffix"] = photo_suffix(path)
         photo = read_photo(path, AcquisitionSettings())
@@ -73,9 +78,11 @@ def judge_photo(path: Path, dictionary: str, others: Others) -> Verdict:
     ids = sorted({found.marker_id for found in detect_markers(grey, dictionary, expected=LEAST_MARKERS)})
     facts |= {"sharpness": round(sharpness, 6), "marker_ids": ids}
     for doubt in (
-        _blurred(sharpness, isotropy, others.sharpness), _exposure(photo.image, grey),
-        _markers(ids, grey, dictionary), _foreign((width, height), others.sizes),
-    ):  # fmt: skip
+        _blurred(sharpness, isotropy, others.sharpness),
+        _exposure(photo.image, grey),
+        _markers(ids, grey, dictionary),
+        _foreign((width, height), others.sizes),
+    ):
         if doubt is not None:
             return Verdict(doubt.verdict, doubt.code, doubt.reason, doubt.advice, facts | doubt.facts)
     return Verdict(facts=facts)

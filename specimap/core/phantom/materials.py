@@ -7,9 +7,16 @@ import numpy as np
 from specimap.core.geometry import Floats
 
 MATERIALS = (
-    "adipose", "fibroglandular", "tumour", "blood",
-    "white_card", "black_ink", "tray", "tray_speckle", "bench",
-)  # fmt: skip
+    "adipose",
+    "fibroglandular",
+    "tumour",
+    "blood",
+    "white_card",
+    "black_ink",
+    "tray",
+    "tray_speckle",
+    "bench",
+)
 ADIPOSE, FIBROGLANDULAR, TUMOUR, BLOOD, WHITE_CARD, BLACK_INK, TRAY, TRAY_SPECKLE, BENCH = range(9)
 
 # Absorption bands: (centre nm, width nm, relative strength). Haemoglobin: Soret, alpha, beta, deoxy 760;
@@ -50,9 +57,11 @@ def endmembers(wavelengths_nm: Floats) -> Floats:
         [sum(a * np.exp(-0.5 * ((wavelengths_nm - c) / w) ** 2) for c, w, a in bands) for bands in _ABSORBERS]
     )
     return np.stack(
-        [level * (left + (1 - left) * rise) * np.exp(-np.array(amounts) @ absorbers)
-         for level, left, amounts in _RECIPES]
-    )  # fmt: skip
+        [
+            level * (left + (1 - left) * rise) * np.exp(-np.array(amounts) @ absorbers)
+            for level, left, amounts in _RECIPES
+        ]
+    )
 
 
 def linear_rgb() -> Floats:

@@ -77,9 +77,7 @@ def render_view(scene: Scene, view: View, paint: Paint, *, gloss: float = 0.0) -
         fine = _sample(scene, view, paint, (pixels[chosen, None] + spread).reshape(-1, 2), gloss)[0]
         colour[chosen] = fine.reshape(len(chosen), n, -1).mean(1)
     points[geometry < 0] = np.nan
-    return Rendering(
-        colour.reshape(h, w, -1), points.reshape(h, w, 3), _CLASS_OF_GEOMETRY[geometry].reshape(h, w)
-    )
+    return Rendering(colour.reshape(h, w, -1), points.reshape(h, w, 3), _CLASS_OF_GEOMETRY[geometry].reshape(h, w))
 
 
 def _rays_per_pixel(surface: NDArray[np.int32], on_specimen: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -142,11 +140,7 @@ def _specimen_colour(
 ) -> Floats32:
     corner = scene.specimen.triangles[hits.triangle[on]]
     u, v = hits.uv[on, :1], hits.uv[on, 1:]
-    at = (
-        (1 - u - v) * paint.vertex[corner[:, 0]]
-        + u * paint.vertex[corner[:, 1]]
-        + v * paint.vertex[corner[:, 2]]
-    )
+    at = (1 - u - v) * paint.vertex[corner[:, 0]] + u * paint.vertex[corner[:, 1]] + v * paint.vertex[corner[:, 2]]
     c = paint.basis.shape[1]
     detail = scene.detail_at(points)
     brightness = np.clip(1 + scene.texture_contrast * _DETAIL_SD * detail, 0.3, 1.7)

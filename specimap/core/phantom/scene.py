@@ -67,8 +67,7 @@ class RayCaster:
     def __init__(self, meshes: list[tuple[Floats, NDArray[np.int32]]]) -> None:
         self._scene = rtcore_scene.EmbreeScene()
         self._meshes = [
-            mesh_construction.TriangleMesh(self._scene, v.astype(np.float32), f.astype(np.int32))
-            for v, f in meshes
+            mesh_construction.TriangleMesh(self._scene, v.astype(np.float32), f.astype(np.int32)) for v, f in meshes
         ]
 
     def cast(self, origin: Floats, directions: Floats) -> Hits:
@@ -108,14 +107,10 @@ class Scene:
 
     def tray_at(self, points: Floats) -> tuple[Floats32, Floats32]:
         """Share of speckle (S,) and irradiance (S,) on the tray under points (S, 3), S < 32768."""
-        xy = ((points[:, :2] + self.tray_half_mm) * (_TRAY_TEXELS / (2 * self.tray_half_mm)) - 0.5).astype(
-            np.float32
-        )
+        xy = ((points[:, :2] + self.tray_half_mm) * (_TRAY_TEXELS / (2 * self.tray_half_mm)) - 0.5).astype(np.float32)
         if not len(xy):
             return np.empty(0, np.float32), np.empty(0, np.float32)
-        maps = cv2.remap(
-            self.tray_maps, xy[:, None], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )[:, 0]
+        maps = cv2.remap(self.tray_maps, xy[:, None], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
         return maps[:, 0], maps[:, 1]
 
 
@@ -175,9 +170,7 @@ def marker_cells(dictionary: str, marker_id: int) -> NDArray[np.bool_]:
             advice=f"Use ids from 0 to {len(table.bytesList) - 1}.",
             setting="marker_ids",
         )
-    return np.asarray(
-        cv2.aruco.generateImageMarker(table, marker_id, table.markerSize + 2, borderBits=1) > 127
-    )
+    return np.asarray(cv2.aruco.generateImageMarker(table, marker_id, table.markerSize + 2, borderBits=1) > 127)
 
 
 def place_cards(settings: PhantomSettings) -> Cards:
@@ -223,9 +216,7 @@ def sky() -> tuple[Floats, Floats]:
     return lights, weights / (weights * z).sum()
 
 
-def _irradiance(
-    caster: RayCaster, points: Floats, normals: Floats, lights: Floats, weights: Floats
-) -> Floats32:
+def _irradiance(caster: RayCaster, points: Floats, normals: Floats, lights: Floats, weights: Floats) -> Floats32:
     """Irradiance (S,) at points (S, 3) with normals (S, 3), shadows included."""
     start = points + 0.02 * normals
     # Light that the tray throws back keeps undersides from turning black.
@@ -239,9 +230,7 @@ def _irradiance(
     return total.astype(np.float32)
 
 
-def _tray_maps(
-    settings: PhantomSettings, caster: RayCaster, half: float, lights: Floats, weights: Floats
-) -> Floats32:
+def _tray_maps(settings: PhantomSettings, caster: RayCaster, half: float, lights: Floats, weights: Floats) -> Floats32:
     texel = 2 * half / _TRAY_TEXELS
     grain = band_noise(settings.rng(Stream.TRAY), (_TRAY_TEXELS,) * 2, 0.55 / texel, 5.0 / texel, 0.7)
     speckle = np.clip(0.4 + 0.3 * settings.texture_contrast * grain, 0, 1)
@@ -250,9 +239,9 @@ def _tray_maps(
     points = np.stack([x, y, np.full_like(x, TRAY_Z_MM)], -1).reshape(-1, 3)
     up = np.broadcast_to([0.0, 0, 1], points.shape)
     light = _irradiance(caster, points, up, lights, weights).reshape(x.shape)
-    return np.stack(
-        [speckle, cv2.resize(light, (_TRAY_TEXELS,) * 2, interpolation=cv2.INTER_LINEAR)], -1
-    ).astype(np.float32)
+    return np.stack([speckle, cv2.resize(light, (_TRAY_TEXELS,) * 2, interpolation=cv2.INTER_LINEAR)], -1).astype(
+        np.float32
+    )
 
 
 def _square(half: float, z: float) -> Floats:

@@ -106,36 +106,58 @@ class PhantomSettings:
 
     def __post_init__(self) -> None:
         least: dict[str, float] = {
-            "seed": 0, "mesh_divisions": 4, "texture_contrast": 0, "gloss": 0, "edge_mm": 0.1,
-            "card_tilt_deg": 0, "card_lift_mm": 0, "photos": 1, "photo_size": 16, "focal_factor": 0.3,
-            "focal_spread": 0, "distance_mm": 60, "blur_px": 0, "exposure_spread": 0, "noise": 0,
-            "cube_rows": 16, "cube_cols": 16, "bands": 1, "hsi_distance_mm": 60, "hsi_tilt_deg": 0,
-            "cube_aspect": 0.1, "scan_skew": -0.5, "scan_pitch_deg": -30, "scan_wobble_mm": 0, "cube_k1": -1,
-            "cube_noise": 0, "bad_band_fraction": 0, "dead_pixel_fraction": 0,
-        }  # fmt: skip
+            "seed": 0,
+            "mesh_divisions": 4,
+            "texture_contrast": 0,
+            "gloss": 0,
+            "edge_mm": 0.1,
+            "card_tilt_deg": 0,
+            "card_lift_mm": 0,
+            "photos": 1,
+            "photo_size": 16,
+            "focal_factor": 0.3,
+            "focal_spread": 0,
+            "distance_mm": 60,
+            "blur_px": 0,
+            "exposure_spread": 0,
+            "noise": 0,
+            "cube_rows": 16,
+            "cube_cols": 16,
+            "bands": 1,
+            "hsi_distance_mm": 60,
+            "hsi_tilt_deg": 0,
+            "cube_aspect": 0.1,
+            "scan_skew": -0.5,
+            "scan_pitch_deg": -30,
+            "scan_wobble_mm": 0,
+            "cube_k1": -1,
+            "cube_noise": 0,
+            "bad_band_fraction": 0,
+            "dead_pixel_fraction": 0,
+        }
         most: dict[str, float] = {
-            "texture_contrast": 2.5, "card_tilt_deg": 20, "hsi_tilt_deg": 20, "focal_spread": 0.1,
-            "cube_aspect": 10, "scan_skew": 0.5, "scan_pitch_deg": 30, "scan_wobble_mm": 2, "cube_k1": 1,
-            "bad_band_fraction": 0.5, "dead_pixel_fraction": 0.5,
-        }  # fmt: skip
+            "texture_contrast": 2.5,
+            "card_tilt_deg": 20,
+            "hsi_tilt_deg": 20,
+            "focal_spread": 0.1,
+            "cube_aspect": 10,
+            "scan_skew": 0.5,
+            "scan_pitch_deg": 30,
+            "scan_wobble_mm": 2,
+            "cube_k1": 1,
+            "bad_band_fraction": 0.5,
+            "dead_pixel_fraction": 0.5,
+        }
         for name, low in least.items():
             value, high = getattr(self, name), most.get(name, np.inf)
             if not low <= value <= high:
-                raise SettingsError(
-                    f"{name} is {value}, outside [{low}, {high}].", advice=_ADVICE, setting=name
-                )
+                raise SettingsError(f"{name} is {value}, outside [{low}, {high}].", advice=_ADVICE, setting=name)
         if not self.marker_ids or len(set(self.marker_ids)) != len(self.marker_ids):
-            raise SettingsError(
-                "marker_ids must hold distinct ids.", advice="List each id once.", setting="marker_ids"
-            )
+            raise SettingsError("marker_ids must hold distinct ids.", advice="List each id once.", setting="marker_ids")
         if not set(self.bare_photos) <= set(range(self.photos)):
-            raise SettingsError(
-                "bare_photos names photos that are not taken.", advice=_ADVICE, setting="bare_photos"
-            )
+            raise SettingsError("bare_photos names photos that are not taken.", advice=_ADVICE, setting="bare_photos")
         if not 0 < self.wavelength_nm[0] < self.wavelength_nm[1]:
-            raise SettingsError(
-                "wavelength_nm must rise.", advice="Give (first, last) in nm.", setting="wavelength_nm"
-            )
+            raise SettingsError("wavelength_nm must rise.", advice="Give (first, last) in nm.", setting="wavelength_nm")
         if not np.isfinite([*self.moved_mm, self.moved_deg]).all() or not abs(self.moved_tilt_deg) <= _MOST_TILT_DEG:
             raise SettingsError(
                 "The specimen's motion is not finite, or tilts it too far.", advice=_ADVICE, setting="moved_mm"

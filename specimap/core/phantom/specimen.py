@@ -140,7 +140,5 @@ def vertex_normals(vertices: Floats, triangles: NDArray[np.int32]) -> Floats:
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     face = np.cross(b - a, c - a)
     corner = triangles.T.ravel()
-    summed = np.stack(
-        [np.bincount(corner, np.tile(face[:, k], 3), minlength=len(vertices)) for k in range(3)], 1
-    )
+    summed = np.stack([np.bincount(corner, np.tile(face[:, k], 3), minlength=len(vertices)) for k in range(3)], 1)
     return np.asarray(summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-12))

@@ -118,9 +118,7 @@ def _read(file: Path) -> Truth:
     with open(file, "rb") as f, np.load(f, allow_pickle=False) as z:  # a damaged file is closed, too
         names = [str(n) for n in z["rgb_files"]]
         sizes = z["rgb_size"] if "rgb_size" in z else [_photo_size(file.parent / n) for n in names]
-        views = [
-            _view(*row) for row in zip(z["rgb_K"], z["rgb_R"], z["rgb_t"], z["rgb_dist"], sizes, strict=True)
-        ]
+        views = [_view(*row) for row in zip(z["rgb_K"], z["rgb_R"], z["rgb_t"], z["rgb_dist"], sizes, strict=True)]
         has_mesh = "mesh_vertices" in z
         return Truth(
             marker_ids=z["marker_ids"],
@@ -145,9 +143,15 @@ def _read(file: Path) -> Truth:
 def _view(K: Floats, R: Floats, t: Floats, dist: Floats, size: NDArray[np.int64] | tuple[int, int]) -> View:
     width, height = (int(s) for s in size)
     lens = Intrinsics(
-        width, height, float(K[0, 0]), float(K[0, 2]), float(K[1, 2]), float(dist[0]), float(dist[1]),
+        width,
+        height,
+        float(K[0, 0]),
+        float(K[0, 2]),
+        float(K[1, 2]),
+        float(dist[0]),
+        float(dist[1]),
         aspect=float(K[0, 0] / K[1, 1]),
-    )  # fmt: skip
+    )
     return View(lens, Pose(R, t))
 
 

@@ -41,14 +41,10 @@ def _angles(count: int, rng: np.random.Generator) -> list[tuple[float, float]]:
     return angles
 
 
-def _photo_view(
-    settings: PhantomSettings, rng: np.random.Generator, azimuth: float, elevation: float
-) -> View:
+def _photo_view(settings: PhantomSettings, rng: np.random.Generator, azimuth: float, elevation: float) -> View:
     farther = settings.scene_mm / _DESIGN_SCENE_MM
     distance = settings.distance_mm * farther * rng.uniform(0.93, 1.04)
-    direction = np.array(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    )
+    direction = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     target = np.array([0, 0, 2.0]) + rng.uniform(-1.5, 1.5, 3) * farther
     pose = look_at(target + distance * direction, target, np.array([0.0, 0, 1]))
     roll = Pose(_roll(np.radians(rng.uniform(-6, 6))), np.zeros(3))

@@ -38,13 +38,9 @@ def write_phantom(
     ``progress`` raises ends the writing.
     """
     if interleave not in _AXES:
-        raise SettingsError(
-            f"interleave is {interleave}.", advice="Use bsq, bil or bip.", setting="interleave"
-        )
+        raise SettingsError(f"interleave is {interleave}.", advice="Use bsq, bil or bip.", setting="interleave")
     if photo_format not in _ENCODERS:
-        raise SettingsError(
-            f"photo_format is {photo_format}.", advice="Use jpg or png.", setting="photo_format"
-        )
+        raise SettingsError(f"photo_format is {photo_format}.", advice="Use jpg or png.", setting="photo_format")
     phantom = Phantom(settings)
     flag = _ENCODERS[photo_format]
     names = []

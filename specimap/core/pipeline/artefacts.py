@@ -134,10 +134,16 @@ def save_stage1(store: Store, key: str, stage: Stage1) -> None:
         arrays[f"confidence_{k}"] = m.confidence
         maps_meta.append({"photo": m.photo, "low": low, "step": step, "lens": asdict(m.intrinsics)})
     meta = {
-        "photos": r.photos, "lens": asdict(r.lens), "maps": maps_meta, "names": stage.names,
-        "refused": [asdict(x) for x in stage.refused], "refused_later": [asdict(x) for x in r.refused],
-        "remarks": r.remarks, "marker_ids": c.marker_ids, "subject_mm": stage.subject_mm,
-    }  # fmt: skip
+        "photos": r.photos,
+        "lens": asdict(r.lens),
+        "maps": maps_meta,
+        "names": stage.names,
+        "refused": [asdict(x) for x in stage.refused],
+        "refused_later": [asdict(x) for x in r.refused],
+        "remarks": r.remarks,
+        "marker_ids": c.marker_ids,
+        "subject_mm": stage.subject_mm,
+    }
     store.save("reconstruct", key, arrays, meta)
 
 
@@ -153,35 +159,50 @@ def load_stage1(store: Store, key: str, *, with_depth: bool = True) -> Stage1 | 
         depth = np.where(packed > 0, (packed.astype(np.float32) - 1) * m["step"] + m["low"], 0).astype(np.float32)
         lens = Intrinsics(**m["lens"])
         maps.append(
-            DepthMap(
-                m["photo"], arrays[f"turn_{k}"], lens, depth, arrays[f"confidence_{k}"], arrays[f"colour_{k}"]
-            )
+            DepthMap(m["photo"], arrays[f"turn_{k}"], lens, depth, arrays[f"confidence_{k}"], arrays[f"colour_{k}"])
         )
     reconstruction = Reconstruction(
-        tuple(meta["photos"]), Intrinsics(**meta["lens"]), _unposes(arrays["poses"]), tuple(maps), arrays["points"],
-        tuple(Refusal(**x) for x in meta["refused_later"]), tuple((a, b) for a, b in meta["remarks"]),
-    )  # fmt: skip
-    seen = Observations(
-        arrays["seen_photo"], arrays["seen_marker"], arrays["seen_corners"], arrays["seen_sigma"]
+        tuple(meta["photos"]),
+        Intrinsics(**meta["lens"]),
+        _unposes(arrays["poses"]),
+        tuple(maps),
+        arrays["points"],
+        tuple(Refusal(**x) for x in meta["refused_later"]),
+        tuple((a, b) for a, b in meta["remarks"]),
     )
+    seen = Observations(arrays["seen_photo"], arrays["seen_marker"], arrays["seen_corners"], arrays["seen_sigma"])
     return Stage1(
-        reconstruction, CornersInPhotos(seen, tuple(meta["marker_ids"])), tuple(meta["names"]),
-        tuple(Refusal(**x) for x in meta["refused"]), meta["subject_mm"],
-        tuple(arrays.get("greys", ())), bytes(arrays.get("sheet", b"")),
-    )  # fmt: skip
+        reconstruction,
+        CornersInPhotos(seen, tuple(meta["marker_ids"])),
+        tuple(meta["names"]),
+        tuple(Refusal(**x) for x in meta["refused"]),
+        meta["subject_mm"],
+        tuple(arrays.get("greys", ())),
+        bytes(arrays.get("sheet", b"")),
+    )
 
 
 def save_stage2(store: Store, key: str, stage: Stage2) -> None:
     """Cameras, corners with covariance, mesh."""
     a, mesh = stage.adjusted, stage.mesh
     arrays = {
-        "poses": _poses(a.poses), "corners": a.corners, "covariance": a.covariance, "vertices": mesh.vertices,
-        "triangles": mesh.triangles, "normals": mesh.normals, "colours": mesh.colours, "sigma": stage.sigma_mm,
-    }  # fmt: skip
+        "poses": _poses(a.poses),
+        "corners": a.corners,
+        "covariance": a.covariance,
+        "vertices": mesh.vertices,
+        "triangles": mesh.triangles,
+        "normals": mesh.normals,
+        "colours": mesh.colours,
+        "sigma": stage.sigma_mm,
+    }
     meta = {
-        "lens": asdict(a.lens), "marker_ids": a.marker_ids, "scale": a.scale, "rms": [a.rms_before_px, a.rms_after_px],
-        "iterations": a.iterations, "observations": a.observations,
-    }  # fmt: skip
+        "lens": asdict(a.lens),
+        "marker_ids": a.marker_ids,
+        "scale": a.scale,
+        "rms": [a.rms_before_px, a.rms_after_px],
+        "iterations": a.iterations,
+        "observations": a.observations,
+    }
     store.save("adjust", key, arrays, meta)
 
 
@@ -192,9 +213,17 @@ def load_stage2(store: Store, key: str) -> Stage2 | None:
         return None
     x, meta = found
     adjusted = Adjusted(
-        Intrinsics(**meta["lens"]), _unposes(x["poses"]), tuple(meta["marker_ids"]), x["corners"], x["covariance"],
-        meta["scale"], meta["rms"][0], meta["rms"][1], meta["iterations"], meta["observations"],
-    )  # fmt: skip
+        Intrinsics(**meta["lens"]),
+        _unposes(x["poses"]),
+        tuple(meta["marker_ids"]),
+        x["corners"],
+        x["covariance"],
+        meta["scale"],
+        meta["rms"][0],
+        meta["rms"][1],
+        meta["iterations"],
+        meta["observations"],
+    )
     return Stage2(adjusted, Mesh(x["vertices"], x["triangles"], x["normals"], x["colours"]), x["sigma"])
 
 
@@ -216,9 +245,7 @@ def load_grids(store: Store, key: str, mesh: Mesh) -> tuple[Grid, Grid] | None:
         return None
     x, meta = found
     coarse, fine = (
-        Grid(
-            cell, x_min, y_min, x[f"{name}_image"], x[f"{name}_xyz"], x[f"{name}_normal"], x[f"{name}_covered"]
-        )
+        Grid(cell, x_min, y_min, x[f"{name}_image"], x[f"{name}_xyz"], x[f"{name}_normal"], x[f"{name}_covered"])
         for name, (cell, x_min, y_min) in zip(GRIDS, meta["grids"], strict=True)
     )
     return coarse, fine

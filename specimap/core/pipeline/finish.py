@@ -76,9 +76,7 @@ def register_and_write(
     """Register the cube, write all results; the report comes last."""
     adjusted, mesh = stage2.adjusted, stage2.mesh
     with clock.stage("register") as progress:
-        points, report = _register(
-            stage1, stage2, cube, settings, caster, grids, remarks, inputs, clock, progress
-        )
+        points, report = _register(stage1, stage2, cube, settings, caster, grids, remarks, inputs, clock, progress)
         report = gated(report, settings.adjust.edge_mm)
         with staged(outputs) as aside:
             write_mesh_ply(aside.mesh, mesh)
@@ -91,9 +89,7 @@ def register_and_write(
                 report = report.model_copy(update={"warnings": [*report.warnings, *found]})
                 return {"report": report.summary(), "settings": settings.as_dict(), "inputs": inputs}
 
-            write_cloud(
-                aside.cloud, points, cube, attributes, progress=lambda share: progress(0.4 + 0.5 * share)
-            )  # fmt: skip
+            write_cloud(aside.cloud, points, cube, attributes, progress=lambda share: progress(0.4 + 0.5 * share))
             write_preview(Cloud.open(aside.cloud), aside.preview)
             if stage1.sheet:
                 aside.sheet.write_bytes(stage1.sheet)
@@ -193,8 +189,7 @@ def _register(
         seconds=dict(clock.seconds),
         reused_stages=list(clock.reused),
         warnings=[
-            Remark(code=c, message=m)
-            for c, m in [*remarks, *remarks_of(stage1, adjusted, found), *settled.remarks()]
+            Remark(code=c, message=m) for c, m in [*remarks, *remarks_of(stage1, adjusted, found), *settled.remarks()]
         ],
         settings=settings.as_dict(),
         inputs=inputs,

@@ -24,14 +24,22 @@ def surface_keys(photos: Mapping[str, str], settings: PipelineSettings) -> dict[
     identity = backend_identity(settings.reconstruct.backend)
     reconstruct = key_of(
         "reconstruct",
-        {"photos": dict(photos), "acquisition": asdict(settings.acquisition), "s": asdict(settings.for_stage1()),
-         **({"backend": identity} if identity else {})},
-    )  # fmt: skip
+        {
+            "photos": dict(photos),
+            "acquisition": asdict(settings.acquisition),
+            "s": asdict(settings.for_stage1()),
+            **({"backend": identity} if identity else {}),
+        },
+    )
     adjust = key_of(
         "adjust",
-        {"before": reconstruct, "s": asdict(settings.adjust), "surface": asdict(settings.surface),
-         "refine": asdict(settings.refine)},
-    )  # fmt: skip
+        {
+            "before": reconstruct,
+            "s": asdict(settings.adjust),
+            "surface": asdict(settings.surface),
+            "refine": asdict(settings.refine),
+        },
+    )
     render = key_of("render", {"before": adjust, "s": asdict(settings.render)})
     return {"reconstruct": reconstruct, "adjust": adjust, "render": render}
 

@@ -49,14 +49,18 @@ def remarks_of(stage1: Stage1, adjusted: Adjusted, found: CubeMarkers) -> list[t
     reach = reach_mm(adjusted.poses, adjusted.corners)
     if not PLAUSIBLE_DISTANCE_MM[0] < reach < PLAUSIBLE_DISTANCE_MM[1]:
         remarks.append(
-            ("scale_implausible",
-             f"With this marker edge the photos were taken {reach:.0f} mm from the markers"
-             f"{likely_unit(edge_lengths(adjusted.corners).mean(), reach)}.")
-        )  # fmt: skip
+            (
+                "scale_implausible",
+                f"With this marker edge the photos were taken {reach:.0f} mm from the markers"
+                f"{likely_unit(edge_lengths(adjusted.corners).mean(), reach)}.",
+            )
+        )
     if disagrees(reach, stage1.subject_mm):
         remarks.append(
-            ("scale_contradicts_exif",
-             f"The photos' EXIF says {stage1.subject_mm:.0f} mm to the subject, the marker edge "
-             f"{reach:.0f} mm: check the edge.")
-        )  # fmt: skip
+            (
+                "scale_contradicts_exif",
+                f"The photos' EXIF says {stage1.subject_mm:.0f} mm to the subject, the marker edge "
+                f"{reach:.0f} mm: check the edge.",
+            )
+        )
     return remarks

@@ -53,9 +53,7 @@ def run_pipeline(
             digests = {p.name: d for p, d in zip(paths, pool.map(_digest, paths), strict=True)}
         keys, store = surface_keys(digests, settings), outputs.store
         kept = load_stage2(store, keys["adjust"])
-        stage1 = reconstruct_stage(
-            paths, settings, store, keys["reconstruct"], clock, workers, with_depth=kept is None
-        )
+        stage1 = reconstruct_stage(paths, settings, store, keys["reconstruct"], clock, workers, with_depth=kept is None)
         stage2 = adjust_stage(stage1, settings, store, keys["adjust"], clock, workers, kept)
         # A cube of a gigabyte comes next; the depth maps have done their work.
         stage1 = stage1.without_depth()
@@ -68,9 +66,17 @@ def run_pipeline(
         caster = RayCaster(stage2.mesh)
         grids = render_stage(stage2, caster, settings, store, keys["render"], clock)
         return register_and_write(
-            stage1, stage2, caster, grids, cube, settings, outputs, clock, remarks,
+            stage1,
+            stage2,
+            caster,
+            grids,
+            cube,
+            settings,
+            outputs,
+            clock,
+            remarks,
             {"key": key, "cube": fingerprint.result(), "photos": digest_of(digests)},
-        )  # fmt: skip
+        )
 
 
 def _digest(path: Path) -> str:

@@ -78,9 +78,10 @@ def disagrees(reach: float, subject_mm: float | None, ratio: float = SUBJECT_DIS
 def likely_unit(edge_mm: float, reach: float) -> str:
     """The units that would put the photos at a usual distance, as the end of a sentence; '' where none does."""
     fitting = [
-        (unit, factor) for unit, factor in OTHER_UNITS.items()
+        (unit, factor)
+        for unit, factor in OTHER_UNITS.items()
         if USUAL_DISTANCE_MM[0] <= reach * factor <= USUAL_DISTANCE_MM[1]
-    ]  # fmt: skip
+    ]
     if not fitting:
         return ""
     return "; " + ", ".join(f"{edge_mm:g} {unit} are {edge_mm * factor:.4g} mm" for unit, factor in fitting)

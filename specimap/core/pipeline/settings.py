@@ -55,9 +55,10 @@ class PipelineSettings:
             low, high = RANGES[name]
             if value is not None and not low <= value <= high:
                 raise SettingsError(
-                    f"{name} is {value:g}; it must be from {low:g} to {high:g}.", advice=advice_on(name, value),
+                    f"{name} is {value:g}; it must be from {low:g} to {high:g}.",
+                    advice=advice_on(name, value),
                     setting=name,
-                )  # fmt: skip
+                )
         choices = {
             "backend": (self.reconstruct.backend, BACKENDS),
             "features": (self.reconstruct.features, FEATURES),

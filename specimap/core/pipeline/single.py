@@ -58,9 +58,14 @@ def _reconstruct(run: StageRun, clock: Clock) -> None:
     _remarks(_cube(run))
     store = Outputs(run.out).store
     reconstruct_stage(
-        photo_paths(run.inputs.photos), run.settings, store, run.keys["reconstruct"], clock, run.workers,
+        photo_paths(run.inputs.photos),
+        run.settings,
+        store,
+        run.keys["reconstruct"],
+        clock,
+        run.workers,
         with_depth=False,
-    )  # fmt: skip
+    )
 
 
 def _adjust(run: StageRun, clock: Clock) -> None:
@@ -93,9 +98,17 @@ def _register(run: StageRun, clock: Clock) -> None:
     # Rendered again only where the grids are of another run of stage 2.
     grids = load_grids(store, key, stage2.mesh) or render_stage(stage2, caster, run.settings, store, key, clock)
     register_and_write(
-        stage1, stage2, caster, grids, cube, run.settings, outputs, clock, _remarks(cube),
+        stage1,
+        stage2,
+        caster,
+        grids,
+        cube,
+        run.settings,
+        outputs,
+        clock,
+        _remarks(cube),
         {"key": run.keys["register"], **run.hashes},
-    )  # fmt: skip
+    )
 
 
 def _cube(run: StageRun) -> Cube:

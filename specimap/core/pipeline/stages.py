@@ -101,15 +101,21 @@ def reconstruct_stage(
             progress=lambda s: progress(0.2 + 0.8 * s),
         )
         if (zooms != 1).any():
-            remark = "focal_breathing", f"The photos' focal lengths differ by {100 * zooms.std():.1f} % " + (
-                "(standard deviation); each photo was brought to the one they share."
+            remark = (
+                "focal_breathing",
+                f"The photos' focal lengths differ by {100 * zooms.std():.1f} % "
+                + ("(standard deviation); each photo was brought to the one they share."),
             )
             reconstruction = replace(reconstruction, remarks=(*reconstruction.remarks, remark))
         stage = Stage1(
-            reconstruction, corners, tuple(p.name for p in photos), tuple(refused), _subject_mm(photos),
+            reconstruction,
+            corners,
+            tuple(p.name for p in photos),
+            tuple(refused),
+            _subject_mm(photos),
             tuple(photos[p].grey for p in reconstruction.photos),
             contact_sheet([photos[p].image for p in reconstruction.photos]),
-        )  # fmt: skip
+        )
         save_stage1(store, key, stage)
         # As stored: depth is rounded there, and a run that goes on later must come out the same.
         return load_stage1(store, key, with_depth=True) or stage
@@ -143,9 +149,15 @@ def adjust_stage(
         check_scale(adjusted.poses, adjusted.corners, settings, stage1.subject_mm)
         maps = tuple(replace(m, depth=m.depth * np.float32(adjusted.scale)) for m in r.maps)
         refined = mesh_of(
-            maps, list(stage1.greys), adjusted.lens, adjusted.poses, adjusted.corners, settings,
-            workers=workers, progress=lambda s: progress(0.05 + 0.9 * s),
-        )  # fmt: skip
+            maps,
+            list(stage1.greys),
+            adjusted.lens,
+            adjusted.poses,
+            adjusted.corners,
+            settings,
+            workers=workers,
+            progress=lambda s: progress(0.05 + 0.9 * s),
+        )
         sigma = mesh_sigma(refined, maps, adjusted.poses, workers=workers)
         stage = Stage2(adjusted, refined.mesh, sigma.astype(float))
         save_stage2(store, key, stage)
@@ -169,10 +181,16 @@ def mesh_of(
     voxel_mm = settings.surface.voxel_mm or VOXEL_PIXELS * pixel_mm / shrinkage
     fused = fuse(list(maps), poses, voxel_mm, settings.surface, progress=lambda s: progress(0.4 * s))
     return refine_mesh(
-        fused, greys, lens, poses, voxel_mm, settings.refine,
-        workers=workers, worth=worth_refining(fused.vertices, corners),
+        fused,
+        greys,
+        lens,
+        poses,
+        voxel_mm,
+        settings.refine,
+        workers=workers,
+        worth=worth_refining(fused.vertices, corners),
         progress=lambda s: progress(0.4 + 0.6 * s),
-    )  # fmt: skip
+    )
 
 
 def render_stage(

@@ -100,9 +100,7 @@ class Aliked:
             tensor = torch.tensor(image).permute(2, 0, 1)[None].float() / 255
             found = self._extractor.forward({"image": tensor})
         xy = unturned(found["keypoints"][0].numpy().astype(float), (image.shape[1], image.shape[0]), quarter_turns)
-        return Features(
-            (xy + 0.5) / factor - 0.5, found["descriptors"][0].numpy(), photo.size, quarter_turns % 4
-        )
+        return Features((xy + 0.5) / factor - 0.5, found["descriptors"][0].numpy(), photo.size, quarter_turns % 4)
 
     def match(self, pairs: Sequence[tuple[Features, Features]]) -> Iterator[Pairs]:
         """See :class:`specimap.core.reconstruct.features.FeatureKind`."""

@@ -102,9 +102,7 @@ class ReconstructionBackend(Protocol):
         ...
 
 
-def corners_in_photos(
-    photos: list[Photo], detections: list[list[Detection]], dictionary: str
-) -> CornersInPhotos:
+def corners_in_photos(photos: list[Photo], detections: list[list[Detection]], dictionary: str) -> CornersInPhotos:
     """Gather detections (one list a photo) and judge them as a whole.
 
     An id that shows twice in a photo is left out there; where that is the rule, it is an error. An id that one

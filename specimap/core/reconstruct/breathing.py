@@ -75,9 +75,13 @@ def settle_breathing(
             corners = without(corners, wrong)
             seen = corners.seen
             solution = solve_from_markers(
-                seen, corners.marker_ids, photos[0].size, edge_mm=edge_mm, focal_px=focal_px,
+                seen,
+                corners.marker_ids,
+                photos[0].size,
+                edge_mm=edge_mm,
+                focal_px=focal_px,
                 start=start_without(solution, wrong),
-            )  # fmt: skip
+            )
         # The last solution is of the corners as they are handed on.
         found = estimate_breathing(solution.scene, solution.seen) if turn < SETTLING else None
         if found is None or (turn == 0 and found.significance < SIGNIFICANT):
@@ -136,9 +140,12 @@ def _zoom_of(
         residual = offset + centre - pixels
         step = 1e-4
         by_cam = np.stack(
-            [np.exp(zoom) * (lens.project(cam + step * axis) - lens.project(cam - step * axis)) / (2 * step)
-             for axis in np.eye(3)], -1,
-        )  # fmt: skip
+            [
+                np.exp(zoom) * (lens.project(cam + step * axis) - lens.project(cam - step * axis)) / (2 * step)
+                for axis in np.eye(3)
+            ],
+            -1,
+        )
         J = np.concatenate([-by_cam @ skew(cam - pose.t), by_cam, offset[..., None]], -1)
         norm = np.linalg.norm(residual, axis=1) / sigma
         root = (np.sqrt(np.minimum(1.0, HUBER / np.maximum(norm, 1e-12))) / sigma)[:, None]

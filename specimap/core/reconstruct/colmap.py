@@ -31,9 +31,7 @@ class ColmapBackend:
         progress: Progress,
     ) -> Reconstruction:
         """See :class:`specimap.core.reconstruct.backend.ReconstructionBackend`."""
-        posed = pose_photos(
-            photos, corners, settings, workers=workers, progress=lambda share: progress(0.15 * share)
-        )
+        posed = pose_photos(photos, corners, settings, workers=workers, progress=lambda share: progress(0.15 * share))
         progress(0.15)
         maps, remarks = measure_depth(
             [photos[p].image for p in posed.photos],
@@ -45,6 +43,11 @@ class ColmapBackend:
             progress=lambda share: progress(0.15 + 0.85 * share),
         )
         return Reconstruction(
-            posed.photos, posed.lens, posed.poses, tuple(maps), sparse_points(maps, posed.poses),
-            posed.refused, (*posed.remarks, *remarks),
-        )  # fmt: skip
+            posed.photos,
+            posed.lens,
+            posed.poses,
+            tuple(maps),
+            sparse_points(maps, posed.poses),
+            posed.refused,
+            (*posed.remarks, *remarks),
+        )

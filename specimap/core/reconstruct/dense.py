@@ -60,9 +60,7 @@ def find_content(
 
     def run(pair: tuple[int, int]) -> NDArray[np.int64]:
         i, j = pair
-        found = match_pair(
-            (shrunk[i], shrunk[j]), small, (poses[i], poses[j]), volume, volume.vertices, i, settings
-        )
+        found = match_pair((shrunk[i], shrunk[j]), small, (poses[i], poses[j]), volume, volume.vertices, i, settings)
         if found is None:
             return np.zeros((0, 3), np.int64)
         cells = np.floor((found.points(poses[i]) - volume.low) / cell).astype(np.int64)
@@ -118,9 +116,7 @@ def dense_depth(
 
     def run(pair: tuple[int, int]) -> DepthMap | None:
         i, j = pair
-        return match_pair(
-            (images[i], images[j]), lens, (poses[i], poses[j]), volume, content, i, settings, shrinkage
-        )
+        return match_pair((images[i], images[j]), lens, (poses[i], poses[j]), volume, content, i, settings, shrinkage)
 
     with ThreadPoolExecutor(workers) as pool:
         for done, depth_map in enumerate(pool.map(run, pairs), 1):

@@ -50,7 +50,6 @@ class DepthSettings:
     uniqueness: int = 8
     device: Device = "auto"
 
-
     def shrinkage(self, lens: Intrinsics) -> float:
         """Factor by which photos of ``lens`` are shrunk before they are matched."""
         return min(self.matching_share, self.most_matching_px / max(lens.width, lens.height))
@@ -116,9 +115,7 @@ def choose_pairs(poses: tuple[Pose, ...], target: Floats, settings: DepthSetting
         badness = np.abs(np.log(np.maximum(angle[i], 0.1) / best)) + 2 * np.log(ratio)
         near = np.flatnonzero((angle[i] >= least) & (angle[i] <= widest) & (ratio < 1.6))
         if len(near) < 2:
-            near = np.flatnonzero(
-                (angle[i] >= least) & (angle[i] <= settings.wide_angle_deg) & (ratio < 1.8)
-            )
+            near = np.flatnonzero((angle[i] >= least) & (angle[i] <= settings.wide_angle_deg) & (ratio < 1.8))
         chosen: list[int] = []
         for j in near[np.argsort(badness[near])]:
             # Partners from different sides see around different corners: skip one close to a chosen one.
@@ -233,10 +230,18 @@ def match_pair(
     ]
     block = settings.block_px
     matcher = cv2.StereoSGBM.create(
-        minDisparity=0, numDisparities=count, blockSize=block, P1=8 * 3 * block**2, P2=32 * 3 * block**2,
-        disp12MaxDiff=1, preFilterCap=31, uniquenessRatio=settings.uniqueness, speckleWindowSize=60,
-        speckleRange=1, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
-    )  # fmt: skip
+        minDisparity=0,
+        numDisparities=count,
+        blockSize=block,
+        P1=8 * 3 * block**2,
+        P2=32 * 3 * block**2,
+        disp12MaxDiff=1,
+        preFilterCap=31,
+        uniquenessRatio=settings.uniqueness,
+        speckleWindowSize=60,
+        speckleRange=1,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )
     found = matcher.compute(*padded)[:, count:].astype(np.float32) / 16
     total = found + least
     usable = (found >= 0) & (total > 0.5)

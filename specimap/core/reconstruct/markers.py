@@ -127,14 +127,10 @@ def _solve_start(
     inner = _reindexed(seen, photos, markers)
     world = tuple(squares[m] for m in markers)
     scene = MarkerScene(lens, tuple(poses[p] for p in photos), corners_of(world, edge_mm), world)
-    scene, info = solve(
-        scene, inner, edge_mm=edge_mm, refine_lens=True, focal_prior_px=focal_prior, iterations=60
-    )
+    scene, info = solve(scene, inner, edge_mm=edge_mm, refine_lens=True, focal_prior_px=focal_prior, iterations=60)
     # A photo whose flipped pose fits the solved markers better is turned over; then once more from there.
     scene, weak = _unflip(scene, inner, edge_mm)
-    scene, info = solve(
-        scene, inner, edge_mm=edge_mm, refine_lens=True, focal_prior_px=focal_prior, iterations=60
-    )
+    scene, info = solve(scene, inner, edge_mm=edge_mm, refine_lens=True, focal_prior_px=focal_prior, iterations=60)
     residual = np.sqrt((scene.residuals(inner) ** 2).sum(-1).mean(1))
     limit = max(OUTLIER_PX, 5 * float(np.median(residual)))
     foreign: dict[int, float] = {}
@@ -145,9 +141,7 @@ def _solve_start(
     keep = np.array([photos[p] not in foreign for p in inner.photo]) & (residual <= limit)
     weak = {photos[p]: pose for p, pose in weak.items()}
     if foreign or not keep.all():
-        scene, info, inner, photos, markers = _without(
-            scene, inner, keep, photos, markers, edge_mm, focal_prior
-        )
+        scene, info, inner, photos, markers = _without(scene, inner, keep, photos, markers, edge_mm, focal_prior)
     ids = tuple(marker_ids[m] for m in markers)
     weak = {p: pose for p, pose in weak.items() if p in photos}
     return MarkerSolution(scene, info, inner, photos, ids, weak, foreign, lost)
@@ -172,9 +166,7 @@ def _without(
     used_p, used_m = np.unique(rest.photo), np.unique(rest.marker)
     inner = _reindexed(rest, tuple(used_p), tuple(used_m))
     squares = tuple(scene.squares[m] for m in used_m) if scene.squares else ()
-    start = MarkerScene(
-        scene.lens, tuple(scene.poses[p] for p in used_p), corners_of(squares, edge_mm), squares
-    )
+    start = MarkerScene(scene.lens, tuple(scene.poses[p] for p in used_p), corners_of(squares, edge_mm), squares)
     solved, info = solve(start, inner, edge_mm=edge_mm, refine_lens=True, focal_prior_px=focal_prior)
     return solved, info, inner, tuple(photos[p] for p in used_p), tuple(markers[m] for m in used_m)
 
@@ -244,9 +236,7 @@ def _chain(
     return tuple(sorted(set(by_photo) - set(poses)))
 
 
-def _unflip(
-    scene: MarkerScene, seen: Observations, edge_mm: float
-) -> tuple[MarkerScene, dict[int, Pose]]:
+def _unflip(scene: MarkerScene, seen: Observations, edge_mm: float) -> tuple[MarkerScene, dict[int, Pose]]:
     """Give each photo the pose, among those its single squares offer, that fits all it sees best.
 
     Returns the scene and the photos that show one marker only and whose other pose fits almost as well.
@@ -268,9 +258,10 @@ def _unflip(
             poses[p] = options[best]
         if len(mine.marker) == 1 and len(options) > 2:
             away = [
-                k for k in range(1, len(options))
+                k
+                for k in range(1, len(options))
                 if np.trace(options[k].R.T @ poses[p].R) < 2.9 and costs[k] < 4 * costs[best] + 0.3
-            ]  # fmt: skip
+            ]
             if away:
                 weak[p] = options[min(away, key=lambda k: costs[k])]
     return MarkerScene(scene.lens, tuple(poses), scene.corners, scene.squares), weak

@@ -61,7 +61,8 @@ def start_without(solution: MarkerSolution, ids: set[int]) -> MarkerSolution:
     keep = [k for k, marker in enumerate(solution.markers) if marker not in ids]
     squares = solution.scene.squares
     scene = replace(
-        solution.scene, corners=solution.scene.corners[keep],
+        solution.scene,
+        corners=solution.scene.corners[keep],
         squares=None if squares is None else tuple(squares[k] for k in keep),
-    )  # fmt: skip
+    )
     return replace(solution, scene=scene, markers=tuple(solution.markers[k] for k in keep))

@@ -48,9 +48,10 @@ class Motion:
         corners = triangulate(self.lens, poses, inner, count)
         missed = (MarkerScene(self.lens, poses, corners, None).residuals(inner) ** 2).sum(-1).mean(1)
         fits = [
-            m for m in range(count)
+            m
+            for m in range(count)
             if np.isfinite(corners[m]).all() and np.sqrt(missed[inner.marker == m].mean()) < CORNERS_PX
-        ]  # fmt: skip
+        ]
         if not fits:
             return None
         corners = corners[fits]
@@ -116,9 +117,11 @@ def _write_database(
     """Keypoints, matches and verified pairs in COLMAP's own form; a photo's name is its index."""
     width, height = size
     camera = pycolmap.Camera(
-        model="SIMPLE_RADIAL", width=width, height=height,
+        model="SIMPLE_RADIAL",
+        width=width,
+        height=height,
         params=[focal_px or FOCAL_START * max(size), width / 2, height / 2, 0.0],
-    )  # fmt: skip
+    )
     camera.has_prior_focal_length = focal_px is not None
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = seed
@@ -158,9 +161,14 @@ def _map(database: Path, scratch: Path, seed: int, workers: int, tick: Tick) -> 
             stop.cancel()
 
     models = pycolmap.incremental_mapping(
-        database, scratch, scratch, options,
-        initial_image_pair_callback=listen, next_image_callback=listen, cancellation_token=stop,
-    )  # fmt: skip
+        database,
+        scratch,
+        scratch,
+        options,
+        initial_image_pair_callback=listen,
+        next_image_callback=listen,
+        cancellation_token=stop,
+    )
     if raised:
         raise raised[0]
     largest = max(models.values(), key=lambda m: m.num_reg_images(), default=None)

@@ -75,13 +75,18 @@ def pose_photos(
 
     if waiting and len(sure) >= LEAST_BY_MARKERS:
         reached = reach_by_places(
-            photos, lens, sure, {p: (poses[p], weak[p]) for p in weak}, waiting, placed, settings,
-            workers=workers, progress=so_far,
-        )  # fmt: skip
-    elif waiting:
-        moved = reach_by_motion(
-            photos, strange, corners, focal, settings, workers=workers, progress=so_far
+            photos,
+            lens,
+            sure,
+            {p: (poses[p], weak[p]) for p in weak},
+            waiting,
+            placed,
+            settings,
+            workers=workers,
+            progress=so_far,
         )
+    elif waiting:
+        moved = reach_by_motion(photos, strange, corners, focal, settings, workers=workers, progress=so_far)
         if moved is None:
             reached = Reached(poses, ())
         else:

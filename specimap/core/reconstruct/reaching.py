@@ -172,9 +172,13 @@ def reach_by_motion(
     def by(name: str) -> None:
         nonlocal best
         found = structure_from_motion(
-            [photos[p] for p in kept], feature_kind(name, workers), focal_px,
-            seed=settings.seed, workers=workers, tick=tick,
-        )  # fmt: skip
+            [photos[p] for p in kept],
+            feature_kind(name, workers),
+            focal_px,
+            seed=settings.seed,
+            workers=workers,
+            tick=tick,
+        )
         count = len(found.poses) if found else 0
         said.append(f"{NAMES[name]} connected {count} of {len(kept)}.")
         if found and (best is None or count > len(best.poses)):

@@ -66,9 +66,12 @@ def at_own_resolution(
     with ThreadPoolExecutor(workers) as pool:
         shrunk = list(pool.map(shrink, photos))
     return shrunk, [
-        [replace(d, corners_px=(d.corners_px + 0.5) * factor - 0.5, sigma_px=d.sigma_px * float(factor.mean()))
-         for d in found] for found in detections
-    ]  # fmt: skip
+        [
+            replace(d, corners_px=(d.corners_px + 0.5) * factor - 0.5, sigma_px=d.sigma_px * float(factor.mean()))
+            for d in found
+        ]
+        for found in detections
+    ]
 
 
 def _even_size(width: int, height: int, share: float) -> tuple[int, int]:

@@ -59,9 +59,7 @@ def medoid(candidates: list[Pose]) -> Pose:
     """The pose that lies closest to all the others."""
     centres = np.stack([c.centre for c in candidates])
     turns = np.stack([c.R for c in candidates])
-    far = np.linalg.norm(centres[:, None] - centres[None], axis=-1) / (
-        1e-9 + np.linalg.norm(centres, axis=-1).mean()
-    )
+    far = np.linalg.norm(centres[:, None] - centres[None], axis=-1) / (1e-9 + np.linalg.norm(centres, axis=-1).mean())
     cosine = (np.einsum("aij,bij->ab", turns, turns) - 1) / 2
     return candidates[int((far + 1 - cosine).sum(1).argmin())]
 

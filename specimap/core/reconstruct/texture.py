@@ -103,4 +103,3 @@ def in_words(share: float, region: str) -> str:
     """What a remark says of a share of ``region``."""
     how = "much" if share >= MUCH else "some" if share >= SOME else "little"
     return f"{100 * share:.0f} % of {region} shows fine texture above the noise: {how}."
-

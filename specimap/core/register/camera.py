@@ -51,9 +51,12 @@ class CubeCamera:
         would move in the cube within what the corners leave open of the camera."""
         step = 1e-4
         J = np.stack(
-            [(moved(self.view, step * e).project(points) - moved(self.view, -step * e).project(points)) / (2 * step)
-             for e in np.eye(len(self.covariance))], -1,
-        )  # fmt: skip
+            [
+                (moved(self.view, step * e).project(points) - moved(self.view, -step * e).project(points)) / (2 * step)
+                for e in np.eye(len(self.covariance))
+            ],
+            -1,
+        )
         J = J * self.span_mm[:, None]
         variance = np.einsum("nij,jk,nik->n", J, self.covariance, J)
         return float(np.sqrt(np.maximum(variance, 0).mean()))
@@ -76,9 +79,15 @@ class CubeCamera:
 
 
 def solve_camera(
-    corners: Floats, corners_px: Floats, sigma_px: Floats, rows: int, cols: int, *,
-    focal_px: float | None = None, anchor: Anchor | None = None,
-) -> CubeCamera:  # fmt: skip
+    corners: Floats,
+    corners_px: Floats,
+    sigma_px: Floats,
+    rows: int,
+    cols: int,
+    *,
+    focal_px: float | None = None,
+    anchor: Anchor | None = None,
+) -> CubeCamera:
     """Solve the camera that sees ``corners`` (N, 3) mm at ``corners_px`` (N, 2); ``sigma_px`` (N,).
 
     With ``focal_px`` the focal length is held, else it is an unknown. ``anchor``: one more point, not of a marker.
@@ -86,9 +95,7 @@ def solve_camera(
     Raises:
         RegistrationError: no camera above the plane sees the corners there.
     """
-    starts = (
-        [focal_px] if focal_px else list(np.geomspace(*FOCAL_RANGE, FOCAL_STARTS) * max(rows, cols))
-    )
+    starts = [focal_px] if focal_px else list(np.geomspace(*FOCAL_RANGE, FOCAL_STARTS) * max(rows, cols))
     best: tuple[float, Pose, float] | None = None
     for focal in starts:
         lens = Intrinsics.centred(cols, rows, focal)
@@ -113,15 +120,18 @@ def solve_camera(
     lens = Intrinsics.centred(cols, rows, best[2])
     first = _refine(corners, corners_px, sigma_px, lens, best[1], focal_px is None, anchor).view
     # Once more from there: steps and covariance are then about the camera that is given.
-    return _refine(
-        corners, corners_px, sigma_px, first.intrinsics, first.cam_from_world, focal_px is None, anchor
-    )
+    return _refine(corners, corners_px, sigma_px, first.intrinsics, first.cam_from_world, focal_px is None, anchor)
 
 
 def _refine(
-    corners: Floats, corners_px: Floats, sigma_px: Floats, lens: Intrinsics, pose: Pose, free_focal: bool,
+    corners: Floats,
+    corners_px: Floats,
+    sigma_px: Floats,
+    lens: Intrinsics,
+    pose: Pose,
+    free_focal: bool,
     anchor: Anchor | None,
-) -> CubeCamera:  # fmt: skip
+) -> CubeCamera:
     start = View(lens, pose)
     weight = 1 / np.maximum(sigma_px, 1e-3)[:, None]
     usual = float(np.sqrt(FOCAL_RANGE[0] * FOCAL_RANGE[1])) * max(lens.width, lens.height)

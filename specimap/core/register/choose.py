@@ -151,8 +151,9 @@ def _with_tissue(views: dict[Model, View], sight: Sight, seen: Sighting) -> dict
         whole = replace(sight, tissue=Tissue.of(seen, sigma_mm))
         fits = {
             (model, moved): fit(view, model, whole, motion=moved)
-            for model, view in views.items() for moved in (False, True)
-        }  # fmt: skip
+            for model, view in views.items()
+            for moved in (False, True)
+        }
         closest = min(fits.values(), key=lambda f: f.cost)
         sigma_mm = max(LEAST_TILE_MM, SIGMA_OF_MAD * float(np.median(np.abs(closest.tile_miss))) * sigma_mm)
     return fits

@@ -127,9 +127,10 @@ def find_in_image(image: NDArray[np.float32], dictionary: str, known: tuple[int,
         # Dead pixels and noise hide bits; a small median gives them back, corners come from the real image.
         calm = cv2.medianBlur(grey, 3)
         found += [
-            d for d in detect_markers(calm, dictionary, expected=0, linear=filled)
+            d
+            for d in detect_markers(calm, dictionary, expected=0, linear=filled)
             if d.marker_id not in {f.marker_id for f in found}
-        ]  # fmt: skip
+        ]
     return [d for d in found if d.marker_id in known]
 
 

@@ -80,7 +80,6 @@ class Fit:
     spared: float
     tile_miss: Floats
 
-
     @property
     def tile_mm(self) -> float:
         """How far tiles show from where the camera expects them, sideways, as a robust root mean square; 0 of none."""
@@ -134,8 +133,12 @@ def fit(start: View, model: Model, sight: Sight, *, motion: bool = False, held: 
     x, base = np.zeros(many), start
     for _ in range(2):
         answer = least_squares(
-            residual, x, args=(base,), x_scale=np.append(STEPS[:free], MOTION_STEPS[: many - free]), loss=robust,
-        )  # fmt: skip
+            residual,
+            x,
+            args=(base,),
+            x_scale=np.append(STEPS[:free], MOTION_STEPS[: many - free]),
+            loss=robust,
+        )
         # Once more from there: steps and covariance are then about the camera that is given.
         base, x = at_markers(moved(base, answer.x[:free])), np.append(np.zeros(free), answer.x[free:])
     miss = base.project(sight.corners) - sight.pixels
@@ -143,9 +146,12 @@ def fit(start: View, model: Model, sight: Sight, *, motion: bool = False, held: 
     spared = float(np.sqrt(corners / max(corners - free, 1)))
     covariance = (np.linalg.pinv(answer.jac.T @ answer.jac) * max(LEAST_SCATTER, scatter))[:free, :free]
     camera = CubeCamera(
-        base, float(np.sqrt((miss**2).sum(-1).mean())), float(np.sqrt(covariance[6, 6])) if free > 6 else 0.0,
-        covariance, model,
-    )  # fmt: skip
+        base,
+        float(np.sqrt((miss**2).sum(-1).mean())),
+        float(np.sqrt(covariance[6, 6])) if free > 6 else 0.0,
+        covariance,
+        model,
+    )
     shift = x[free:] if motion else np.zeros(3)
     tiles = tissue.miss(base, shift) if tissue is not None else np.empty((0, 2))
     return Fit(camera, sight, float(2 * answer.cost), shift, float(np.sqrt(scatter)), spared, tiles)

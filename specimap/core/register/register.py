@@ -124,9 +124,14 @@ def place_by_camera(view: View, caster: RayCaster, mirrored: bool) -> Placement:
         keep = hits.hit
         normals, rgb = caster.normals(hits)[keep], caster.colours(hits)[keep]
         return _placed(
-            np.stack([rows[keep], cols[keep]], -1), hits.xyz[keep], normals, rgb, view, caster,
+            np.stack([rows[keep], cols[keep]], -1),
+            hits.xyz[keep],
+            normals,
+            rgb,
+            view,
+            caster,
             (hits.triangle[keep], hits.barycentric[keep]),
-        )  # fmt: skip
+        )
 
     return _in_strips(view, mirrored, place)
 
@@ -175,9 +180,15 @@ def _placed(
         up = np.broadcast_to([0.0, 0.0, 1.0], xyz.shape)
         undercut = caster.cast(xyz.astype(float) + CLEARANCE_MM * up, up).hit
     return Placement(
-        pixels.astype(np.uint16), xyz.astype(np.float32), normal.astype(np.float32), rgb,
-        np.degrees(np.arccos(cosine)).astype(np.float32), occluded, undercut, *where,
-    )  # fmt: skip
+        pixels.astype(np.uint16),
+        xyz.astype(np.float32),
+        normal.astype(np.float32),
+        rgb,
+        np.degrees(np.arccos(cosine)).astype(np.float32),
+        occluded,
+        undercut,
+        *where,
+    )
 
 
 def _hidden_from(view: View, xyz: NDArray[np.float32], caster: RayCaster) -> NDArray[np.bool_]:

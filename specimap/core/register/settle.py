@@ -141,9 +141,14 @@ def settle_camera(
 
 
 def _settle_square(
-    camera: CubeCamera, choice: Choice, seen: CornersInCube, rows: int, cols: int, sample: Floats,
+    camera: CubeCamera,
+    choice: Choice,
+    seen: CornersInCube,
+    rows: int,
+    cols: int,
+    sample: Floats,
     sight: Callable[[View], Sighting | None],
-) -> Settled:  # fmt: skip
+) -> Settled:
     """A frame camera of square pixels: by its markers, or with the specimen's middle where they leave it open."""
     flat, markers = seen.flat(), len(seen.marker_ids)
     if not len(sample):
@@ -162,8 +167,9 @@ def _settle_square(
             break
         across = np.array([*shift.shift_mm, 0.0])
         pixel = camera.view.project((centre + across)[None])[0]
-        before, camera = camera, solve_camera(
-            *flat, rows, cols, anchor=Anchor(centre, pixel, shift.sigma_mm / camera.pixel_mm)
+        before, camera = (
+            camera,
+            solve_camera(*flat, rows, cols, anchor=Anchor(centre, pixel, shift.sigma_mm / camera.pixel_mm)),
         )
         settled = True
         shift = look(camera)

@@ -208,5 +208,3 @@ def _peak(three: NDArray[np.float32]) -> float:
     a, b, c = (float(v) for v in three)
     bend = a - 2 * b + c
     return float(np.clip((a - c) / (2 * bend), -0.5, 0.5)) if bend < 0 else 0.0
-
-

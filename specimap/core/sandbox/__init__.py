@@ -9,6 +9,13 @@ from specimap.core.sandbox.launch import Confinement, Protection, confined, hide
 from specimap.core.sandbox.places import MODES, Mode, Reach, program_rules
 
 __all__ = [
-    "MODES", "Confinement", "Mode", "Protection", "Reach", "confined", "hide_from_others", "program_rules",
+    "MODES",
+    "Confinement",
+    "Mode",
+    "Protection",
+    "Reach",
+    "confined",
+    "hide_from_others",
+    "program_rules",
     "protection",
-]  # fmt: skip
+]

@@ -18,16 +18,46 @@ Rule = tuple[str, int]
 
 _SHARED = ("/usr", "/usr/local")
 _LIBRARIES = (
-    *(f"{prefix}/{name}" for prefix in _SHARED
-      for name in ("bin", "sbin", "lib", "lib32", "lib64", "libexec", "share", "include")),
-    "/lib", "/lib32", "/lib64", "/bin", "/sbin", "/nix/store", "/gnu/store",
-)  # fmt: skip
+    *(
+        f"{prefix}/{name}"
+        for prefix in _SHARED
+        for name in ("bin", "sbin", "lib", "lib32", "lib64", "libexec", "share", "include")
+    ),
+    "/lib",
+    "/lib32",
+    "/lib64",
+    "/bin",
+    "/sbin",
+    "/nix/store",
+    "/gnu/store",
+)
 _FILES = (
-    "/etc/ld.so.cache", "/etc/ld.so.conf", "/etc/ld.so.conf.d", "/etc/localtime", "/etc/timezone", "/etc/passwd",
-    "/etc/group", "/etc/nsswitch.conf", "/etc/hosts", "/etc/mime.types", "/etc/fonts", "/etc/alternatives",
-    "/etc/OpenCL", "/proc/cpuinfo", "/proc/meminfo", "/proc/stat", "/proc/filesystems", "/proc/version",
-    "/proc/sys/vm", "/proc/self", "/sys/devices/system", "/sys/fs/cgroup", "/dev/urandom", "/dev/random", "/dev/zero",
-)  # fmt: skip
+    "/etc/ld.so.cache",
+    "/etc/ld.so.conf",
+    "/etc/ld.so.conf.d",
+    "/etc/localtime",
+    "/etc/timezone",
+    "/etc/passwd",
+    "/etc/group",
+    "/etc/nsswitch.conf",
+    "/etc/hosts",
+    "/etc/mime.types",
+    "/etc/fonts",
+    "/etc/alternatives",
+    "/etc/OpenCL",
+    "/proc/cpuinfo",
+    "/proc/meminfo",
+    "/proc/stat",
+    "/proc/filesystems",
+    "/proc/version",
+    "/proc/sys/vm",
+    "/proc/self",
+    "/sys/devices/system",
+    "/sys/fs/cgroup",
+    "/dev/urandom",
+    "/dev/random",
+    "/dev/zero",
+)
 _CACHES = ("matplotlib", "specimap")
 """Below the user's cache folder: lists of fonts, and the sums of weights."""
 _GPU_PLACES = ("/proc", "/sys")
@@ -62,9 +92,10 @@ def program_rules(reach: Reach) -> list[Rule]:
         own += [(Path(place), landlock.READ) for place in _GPU_PLACES]
         own += [(place, landlock.DEVICE) for place in _gpu_devices()]
     found = {
-        (str(part), rights) for place, rights in own
+        (str(part), rights)
+        for place, rights in own
         for part in ([place] if rights == landlock.READ_DIR else _without(_real(place), kept))
-    }  # fmt: skip
+    }
     found |= {(str(_real(path)), landlock.READ) for path in reach.read}
     found |= {(str(_real(path)), landlock.WRITE) for path in reach.write}
     return sorted(found)

@@ -146,7 +146,15 @@ def _view(session: Session, row: Acquisition) -> AcquisitionView:
     stored = session.scalars(sa.select(StoredFile).where(StoredFile.acquisition_id == row.id))
     lacking = missing(session, row.id)
     return AcquisitionView(
-        id=row.id, specimen_id=row.specimen_id, accession_number=row.accession_number, dictionary=row.dictionary,
-        edge_mm=row.edge_mm, notes=row.notes, created_at=row.created_at, created_by=row.created_by,
-        files=counts(stored), ready=not lacking, missing=lacking,
-    )  # fmt: skip
+        id=row.id,
+        specimen_id=row.specimen_id,
+        accession_number=row.accession_number,
+        dictionary=row.dictionary,
+        edge_mm=row.edge_mm,
+        notes=row.notes,
+        created_at=row.created_at,
+        created_by=row.created_by,
+        files=counts(stored),
+        ready=not lacking,
+        missing=lacking,
+    )

@@ -75,9 +75,13 @@ def create_export(
             row = None
         if row is None:
             row = models.Export(
-                id=new_id("exp"), cloud_id=cloud_id, format=format.value, state="queued",
-                correlation_id=correlation_id(), created_by=principal.key_id,
-            )  # fmt: skip
+                id=new_id("exp"),
+                cloud_id=cloud_id,
+                format=format.value,
+                state="queued",
+                correlation_id=correlation_id(),
+                created_by=principal.key_id,
+            )
             session.add(row)
             session.flush()
             priority = PRIORITIES["routine"]
@@ -166,17 +170,28 @@ def _mesh_key(cloud: CloudRecord) -> str:
 def _mesh_ply(context: AppContext, cloud: CloudRecord) -> Export:
     """The mesh as the run left it: an export that needs no row."""
     return Export(
-        id=cloud.id.replace("cloud_", "exp_"), cloud_id=cloud.id, format=FileFormat.MESH_PLY, state="succeeded",
-        size=context.storage.stat(_mesh_key(cloud)).size, error=None, created_at=cloud.created_at,
+        id=cloud.id.replace("cloud_", "exp_"),
+        cloud_id=cloud.id,
+        format=FileFormat.MESH_PLY,
+        state="succeeded",
+        size=context.storage.stat(_mesh_key(cloud)).size,
+        error=None,
+        created_at=cloud.created_at,
         links=_links(cloud.id, FileFormat.MESH_PLY),
-    )  # fmt: skip
+    )
 
 
 def _shown(row: models.Export) -> Export:
     return Export(
-        id=row.id, cloud_id=row.cloud_id, format=FileFormat(row.format), state=row.state, size=row.size,
-        error=row.error, created_at=row.created_at, links=_links(row.cloud_id, FileFormat(row.format)),
-    )  # fmt: skip
+        id=row.id,
+        cloud_id=row.cloud_id,
+        format=FileFormat(row.format),
+        state=row.state,
+        size=row.size,
+        error=row.error,
+        created_at=row.created_at,
+        links=_links(row.cloud_id, FileFormat(row.format)),
+    )
 
 
 def _links(cloud_id: str, format: FileFormat) -> dict[str, str]:

@@ -46,7 +46,8 @@ FORM: dict[str, Any] = {
                     "required": ["role", "file"],
                     "properties": {
                         "role": {
-                            "type": "string", "enum": ["photo", "cube", "white", "dark"],
+                            "type": "string",
+                            "enum": ["photo", "cube", "white", "dark"],
                             "description": "Of the files that follow it.",
                         },
                         "sha256": {"type": "string", "description": "Of the next file, in hexadecimal digits."},
@@ -56,7 +57,7 @@ FORM: dict[str, Any] = {
             }
         },
     }
-}  # fmt: skip
+}
 
 
 class _Room:
@@ -137,10 +138,17 @@ def _store(context: AppContext, principal: Principal, acquisition_id: str, parts
         row = take_in(
             context,
             Arrival(
-                new_id("file"), acquisition_id, part.role, shown_name(part.name), part.path, part.size, part.sha256,
-                principal.key_id, principal,
+                new_id("file"),
+                acquisition_id,
+                part.role,
+                shown_name(part.name),
+                part.path,
+                part.size,
+                part.sha256,
+                principal.key_id,
+                principal,
             ),
-        )  # fmt: skip
+        )
         stored.append(File.model_validate(row))
     return stored
 

@@ -74,9 +74,12 @@ class Audited(BaseModel):
 def create_key(context: Context, principal: Admin, wanted: KeyRequest) -> NewKey:
     """Make a key."""
     row, key = new_key(
-        wanted.name, wanted.scopes, expires_at=wanted.expires_at, rate_per_minute=wanted.rate_per_minute,
+        wanted.name,
+        wanted.scopes,
+        expires_at=wanted.expires_at,
+        rate_per_minute=wanted.rate_per_minute,
         quota_bytes=wanted.quota_bytes,
-    )  # fmt: skip
+    )
     with context.database.session() as session:
         session.add(row)
         audit(session, principal.key_id, "key.create", row.id, scopes=row.scopes)

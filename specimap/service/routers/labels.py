@@ -209,9 +209,13 @@ def get_values(
             return arrow_answer(array.shape[0], columns, described, headers)
         assert media == JSON
         shown = {
-            "cloud_id": cloud_id, "name": name, "version": row.version, "kind": row.kind, "classes": row.classes,
+            "cloud_id": cloud_id,
+            "name": name,
+            "version": row.version,
+            "kind": row.kind,
+            "classes": row.classes,
             "values": array.read(0, array.shape[0]),
-        }  # fmt: skip
+        }
         return json_answer(shown, headers)
 
 
@@ -246,11 +250,19 @@ def _shown(row: LabelVersion) -> Label:
     own = f"{base}/labels/{row.name}"
     metadata = LabelMetadata(kind=row.kind, classes=row.classes, made_by=row.made_by)  # type: ignore[arg-type]
     return Label(
-        cloud_id=row.cloud_id, name=row.name, version=row.version, kind=row.kind, classes=metadata.classes,
-        made_by=metadata.made_by, sha256=row.sha256, created_at=row.created_at, created_by=row.created_by,
+        cloud_id=row.cloud_id,
+        name=row.name,
+        version=row.version,
+        kind=row.kind,
+        classes=metadata.classes,
+        made_by=metadata.made_by,
+        sha256=row.sha256,
+        created_at=row.created_at,
+        created_by=row.created_by,
         links={
-            "self": f"{own}?version={row.version}", "values": f"{own}/values?version={row.version}",
+            "self": f"{own}?version={row.version}",
+            "values": f"{own}/values?version={row.version}",
             "preview": f"{base}/previews/label.png?name={row.name}&version={row.version}",
             "zarr": f"{base}/zarr/labels/{row.name}",
         },
-    )  # fmt: skip
+    )

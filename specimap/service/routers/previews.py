@@ -48,15 +48,17 @@ PNG: dict[int | str, dict[str, Any]] = {
         "headers": {
             "ETag": {"schema": {"type": "string"}},
             "X-Specimap-Range": {
-                "description": "Values at the ends of the colour scale: low,high.", "schema": {"type": "string"},
+                "description": "Values at the ends of the colour scale: low,high.",
+                "schema": {"type": "string"},
             },
             "X-Specimap-Extent-Mm": {
-                "description": "With grid=marker, the edges: x_min,y_min,x_max,y_max.", "schema": {"type": "string"},
+                "description": "With grid=marker, the edges: x_min,y_min,x_max,y_max.",
+                "schema": {"type": "string"},
             },
         },
     },
     304: {"description": "The client has it."},
-}  # fmt: skip
+}
 
 
 @router.get("/rgb.png", response_class=Response, responses=PNG)

@@ -78,9 +78,10 @@ def show_point(
 
 BODY: dict[str, Any] = {
     "requestBody": {
-        "required": True, "content": {JSON: {"schema": {"$ref": "#/components/schemas/SpectraRequest"}}},
+        "required": True,
+        "content": {JSON: {"schema": {"$ref": "#/components/schemas/SpectraRequest"}}},
     }
-}  # fmt: skip
+}
 
 
 async def _wanted(request: Request) -> SpectraRequest:

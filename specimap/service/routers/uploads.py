@@ -66,11 +66,13 @@ def get_result(context: Context, principal: Uploader, files: Files, upload_id: U
     upload = uploads.current(context, files, upload_id, principal)
     stored = _stored(context, upload)
     return UploadResult(
-        id=upload.id, state=cast(State, upload.state), size=upload.size,
+        id=upload.id,
+        state=cast(State, upload.state),
+        size=upload.size,
         offset=upload.size if upload.state in ("finished", "failed") else files.size(upload.id) or 0,
         file=None if stored is None else File.model_validate(stored),
         error=None if upload.error is None else Failure.model_validate(upload.error),
-    )  # fmt: skip
+    )
 
 
 @router.options("/uploads", status_code=204, response_class=Response)
@@ -78,10 +80,11 @@ def get_abilities(context: Context, principal: Uploader) -> Response:
     """What this tus server can do: the `Tus-…` headers of the answer."""
     settings = context.settings
     headers = {
-        "Tus-Version": tus.VERSION, "Tus-Extension": tus.EXTENSIONS,
+        "Tus-Version": tus.VERSION,
+        "Tus-Extension": tus.EXTENSIONS,
         "Tus-Max-Size": str(max(settings.max_photo_bytes, settings.max_cube_bytes)),
         "Tus-Checksum-Algorithm": ",".join(tus.ALGORITHMS),
-    }  # fmt: skip
+    }
     return Response(status_code=204, headers=headers)
 
 
@@ -202,11 +205,14 @@ _BODY: dict[str, Any] = {
     "requestBody": {"required": True, "content": {OCTETS: {"schema": {"type": "string", "format": "binary"}}}},
     "parameters": [
         {
-            "name": "Upload-Checksum", "in": "header", "required": False, "schema": {"type": "string"},
+            "name": "Upload-Checksum",
+            "in": "header",
+            "required": False,
+            "schema": {"type": "string"},
             "description": "sha1, sha256 or md5 of the body, a space, and the digest in base64.",
         }
     ],
-}  # fmt: skip
+}
 DOCUMENTED: dict[str, dict[str, Any]] = {
     "POST": {
         "summary": "Create an upload",
@@ -214,8 +220,11 @@ DOCUMENTED: dict[str, dict[str, Any]] = {
         "with its value in base64. The answer's `Location` takes the bytes. The body is empty.",
         "headers": ("Location", "Upload-Expires"),
     },
-    "HEAD": {"summary": "Ask how much has arrived", "description": "`Upload-Offset` says where to go on.",
-             "headers": ("Upload-Offset", "Upload-Length", "Upload-Metadata")},
+    "HEAD": {
+        "summary": "Ask how much has arrived",
+        "description": "`Upload-Offset` says where to go on.",
+        "headers": ("Upload-Offset", "Upload-Length", "Upload-Metadata"),
+    },
     "PATCH": {
         "summary": "Send bytes",
         "description": "From `Upload-Offset` on; with `Upload-Checksum` (sha1, sha256 or md5, and the digest in "
@@ -224,7 +233,7 @@ DOCUMENTED: dict[str, dict[str, Any]] = {
         "headers": ("Upload-Offset", "Upload-Expires", "Specimap-File", "Specimap-Verdict"),
     },
     "DELETE": {"summary": "End an upload", "description": "Its bytes are forgotten.", "headers": ()},
-}  # fmt: skip
+}
 
 
 def _document(route: APIRoute) -> None:
@@ -245,18 +254,24 @@ def mount(app: FastAPI, context: AppContext) -> None:
     """Add the tus routes to the app."""
     files = app.state.upload_files = UploadFiles(context.settings.scratch / "uploads")
     store = UploadStore(
-        files, received=context.metrics.uploaded.inc,
+        files,
+        received=context.metrics.uploaded.inc,
         delete=lambda upload_id, principal: uploads.terminate(context, files, upload_id, principal),
-    )  # fmt: skip
+    )
     # Its annotations leave out that hooks may be coroutines and return something.
     hooks: dict[str, Any] = {
-        "pre_create_dep": _creating, "upload_complete_dep": _completing, "file_dep": _naming,
-    }  # fmt: skip
+        "pre_create_dep": _creating,
+        "upload_complete_dep": _completing,
+        "file_dep": _naming,
+    }
     library = create_tus_router(
-        prefix=tus.PREFIX, files_dir=str(files.folder), storage=store, tags=["uploads"],
+        prefix=tus.PREFIX,
+        files_dir=str(files.folder),
+        storage=store,
+        tags=["uploads"],
         max_size=max(context.settings.max_photo_bytes, context.settings.max_cube_bytes),
         **hooks,
-    )  # fmt: skip
+    )
     # Its OPTIONS advertises extensions that are not served here.
     library.routes[:] = [
         route for route in library.routes if isinstance(route, APIRoute) and route.methods != {"OPTIONS"}

@@ -69,9 +69,7 @@ class Da3Backend:
         """
         own = self._settings or settings_from_environment()
         weights, code = own.find_weights(), own.code_path()
-        posed = pose_photos(
-            photos, corners, settings, workers=workers, progress=lambda share: progress(0.1 * share)
-        )
+        posed = pose_photos(photos, corners, settings, workers=workers, progress=lambda share: progress(0.1 * share))
         progress(0.1)
         volume = volume_over(posed.corners, posed.poses)
         shown = [photos[p] for p in posed.photos]
@@ -91,9 +89,13 @@ class Da3Backend:
         views, network = [View(preparation.intrinsics, p) for p in posed.poses], answer.arrays["depth"]
         progress(0.85)
         features = placed_features(
-            shown, posed.lens, posed.poses, volume.centre,
-            workers=workers, progress=lambda share: progress(0.85 + 0.1 * share),
-        )  # fmt: skip
+            shown,
+            posed.lens,
+            posed.poses,
+            volume.centre,
+            workers=workers,
+            progress=lambda share: progress(0.85 + 0.1 * share),
+        )
         metric: list[Metric | None] = []
         for photo, places, view, depth in zip(posed.photos, features, views, network, strict=True):
             points = np.concatenate([on_markers(posed.corners, corners.seen, photo), places])
@@ -107,9 +109,14 @@ class Da3Backend:
         )
         progress(1.0)
         return Reconstruction(
-            posed.photos, posed.lens, posed.poses, tuple(maps), sparse_points(maps, posed.poses),
-            posed.refused, (*posed.remarks, *remarks),
-        )  # fmt: skip
+            posed.photos,
+            posed.lens,
+            posed.poses,
+            tuple(maps),
+            sparse_points(maps, posed.poses),
+            posed.refused,
+            (*posed.remarks, *remarks),
+        )
 
     def _infer(
         self,
@@ -121,9 +128,15 @@ class Da3Backend:
     ) -> Answer:
         try:
             return run_child(
-                self._child, request, arrays, name=NAME, steps={"depth": 1.0}, progress=progress,
-                python=own.python, extra_path=code,
-            )  # fmt: skip
+                self._child,
+                request,
+                arrays,
+                name=NAME,
+                steps={"depth": 1.0},
+                progress=progress,
+                python=own.python,
+                extra_path=code,
+            )
         except BackendFailedError as error:
             if error.details.get("reason") != "out_of_memory":
                 raise

@@ -106,8 +106,12 @@ def run(
         depth[window] = infer(network, device, images[window], arrays["K"][window], arrays["poses"][window])
         done += len(window)
         step(STEP, 0.1 + 0.9 * done / len(images))
-    facts = {"variant": variant, "device": str(device), "torch": torch.__version__,
-             "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
+    facts = {
+        "variant": variant,
+        "device": str(device),
+        "torch": torch.__version__,
+        "seconds": round(time.perf_counter() - start, 1),
+    }
     return {"depth": depth}, facts
 
 

@@ -78,9 +78,7 @@ class Da3Settings:
                 advice=f"Name the published {WEIGHTS_FILE}, or its folder, in {PREFIX}WEIGHTS. {SOURCE}",
                 missing=WEIGHTS_FILE,
             )
-        return find_weights(
-            "Depth Anything 3", f"{PREFIX}WEIGHTS", path, pin=self.weights_sha256, source=SOURCE
-        )
+        return find_weights("Depth Anything 3", f"{PREFIX}WEIGHTS", path, pin=self.weights_sha256, source=SOURCE)
 
 
 def settings_from_environment(environment: Mapping[str, str] = os.environ) -> Da3Settings:

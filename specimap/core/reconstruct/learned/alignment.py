@@ -95,9 +95,7 @@ def align(network: Floats, true: Floats, *, seed: int = 0) -> Alignment | None:
     rng = np.random.default_rng(seed)
     fits = [_robust(rows[:, :terms], rng) for terms in (1, 2)]
     spread = float(np.subtract(*np.percentile(z, [95, 5]))) / unit[1]
-    with_shift = (
-        spread > SHIFT_SPREAD and fits[1][1] < SHIFT_GAIN * fits[0][1] and fits[1][2].sum() >= fits[0][2].sum()
-    )
+    with_shift = spread > SHIFT_SPREAD and fits[1][1] < SHIFT_GAIN * fits[0][1] and fits[1][2].sum() >= fits[0][2].sum()
     unknowns, scatter, near = fits[int(with_shift)]
     a = float(unknowns[0]) * unit[0] / unit[1]
     b = float(unknowns[1]) / unit[1] if with_shift else 0.0

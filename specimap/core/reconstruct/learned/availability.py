@@ -122,9 +122,12 @@ def diagnose() -> Diagnosis:
     asked.close()
     colmap.close()
     machine = Machine(
-        cpu_count(), os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), gpus,
-        len(torch["gpus"]) if "gpus" in torch else None, bool(found.get("pycolmap_cuda")),
-    )  # fmt: skip
+        cpu_count(),
+        os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
+        gpus,
+        len(torch["gpus"]) if "gpus" in torch else None,
+        bool(found.get("pycolmap_cuda")),
+    )
     return Diagnosis(machine, parts)
 
 

@@ -62,9 +62,13 @@ def probe(python: str, modules: tuple[str, ...]) -> dict[str, Any]:
     environment.pop("TMPDIR")
     try:
         done = subprocess.run(
-            [python, "-c", PROBE, ",".join(modules), ",".join(IMPORTED)], capture_output=True, text=True,
-            timeout=PROBE_SECONDS, env=environment, stdin=subprocess.DEVNULL,
-        )  # fmt: skip
+            [python, "-c", PROBE, ",".join(modules), ",".join(IMPORTED)],
+            capture_output=True,
+            text=True,
+            timeout=PROBE_SECONDS,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+        )
     except (OSError, subprocess.TimeoutExpired) as error:
         return {"modules": {}, "failed": str(error)}
     try:
@@ -81,11 +85,12 @@ def driver_gpus() -> tuple[dict[str, Any], ...]:
     try:
         done = subprocess.run(
             ["nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader,nounits"],
-            capture_output=True, text=True, timeout=PROBE_SECONDS, check=True,
-        )  # fmt: skip
-        rows = [[cell.strip() for cell in line.rsplit(",", 2)] for line in done.stdout.splitlines() if line.strip()]
-        return tuple(
-            {"name": name, "memory_bytes": int(mib) * 1024**2, "driver": driver} for name, mib, driver in rows
+            capture_output=True,
+            text=True,
+            timeout=PROBE_SECONDS,
+            check=True,
         )
+        rows = [[cell.strip() for cell in line.rsplit(",", 2)] for line in done.stdout.splitlines() if line.strip()]
+        return tuple({"name": name, "memory_bytes": int(mib) * 1024**2, "driver": driver} for name, mib, driver in rows)
     except (OSError, ValueError, subprocess.SubprocessError):
         return ()

@@ -81,8 +81,11 @@ def run_child(
     """
     with _folder(name, scratch, keep) as folder:
         with disk_errors(folder):
-            given = {"script": str(script), "extra_path": [str(p) for p in extra_path],
-                     "request": {**request, "folder": str(folder)}}  # fmt: skip
+            given = {
+                "script": str(script),
+                "extra_path": [str(p) for p in extra_path],
+                "request": {**request, "folder": str(folder)},
+            }
             (folder / child.REQUEST).write_text(json_text(given), "utf-8")
             np.savez(folder / child.ARRAYS, allow_pickle=False, **arrays)
         facts = _Child(name, folder, python or sys.executable, environment or {}).answer(steps, progress)
@@ -120,9 +123,14 @@ class _Child:
                 # end, in whichever way, and it ends by that.
                 self._process = subprocess.Popen(
                     [python, str(Path(child.__file__).resolve()), str(folder), str(to_parent)],
-                    stdin=subprocess.PIPE, stdout=log, stderr=log, pass_fds=(to_parent,), start_new_session=True,
-                    cwd=folder, env=child_environment(folder, environment),
-                )  # fmt: skip
+                    stdin=subprocess.PIPE,
+                    stdout=log,
+                    stderr=log,
+                    pass_fds=(to_parent,),
+                    start_new_session=True,
+                    cwd=folder,
+                    env=child_environment(folder, environment),
+                )
         except OSError as error:
             os.close(self._from_child)
             raise BackendUnavailableError(
@@ -230,8 +238,9 @@ class _Child:
 
 def leaf_of(code: str) -> type[SpecimapError] | None:
     """The leaf of SpecimapError with that code; None where there is none."""
-    known = {leaf.code: leaf for leaf in vars(errors).values()
-             if isinstance(leaf, type) and issubclass(leaf, SpecimapError)}  # fmt: skip
+    known = {
+        leaf.code: leaf for leaf in vars(errors).values() if isinstance(leaf, type) and issubclass(leaf, SpecimapError)
+    }
     return known.get(code)
 
 

@@ -27,9 +27,7 @@ class Weights:
     pinned: bool
 
 
-def find_weights(
-    name: str, variable: str, path: Path | None, *, pin: str | None = None, source: str = ""
-) -> Weights:
+def find_weights(name: str, variable: str, path: Path | None, *, pin: str | None = None, source: str = "") -> Weights:
     """The weights of backend ``name``, which ``variable`` names; ``source`` says in the advice where they come from.
 
     ``pin``: the sha256 that the file must have, as 64 hexadecimal digits.

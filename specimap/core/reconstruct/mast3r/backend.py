@@ -74,20 +74,36 @@ class Mast3rBackend:
         plan = plan_preparation(photos[0].size, chosen.size_px)
         images = np.stack([plan.apply(p.image) for p in photos])
         request = {
-            "home": home, "weights": weights.path, "device": chosen.device, "subsample": chosen.subsample,
-            "schedule": chosen.schedule, "pairs": chosen.pairs(len(photos)), "seed": settings.seed,
-            "threads": workers, "names": [p.name for p in photos],
-        }  # fmt: skip
+            "home": home,
+            "weights": weights.path,
+            "device": chosen.device,
+            "subsample": chosen.subsample,
+            "schedule": chosen.schedule,
+            "pairs": chosen.pairs(len(photos)),
+            "seed": settings.seed,
+            "threads": workers,
+            "names": [p.name for p in photos],
+        }
         answer = run_child(
-            self._script or CHILD, request, {"images": images}, name=NAME, steps=STEPS, python=chosen.python,
-            scratch=chosen.cache, progress=lambda share: progress(0.95 * share),
-        )  # fmt: skip
+            self._script or CHILD,
+            request,
+            {"images": images},
+            name=NAME,
+            steps=STEPS,
+            python=chosen.python,
+            scratch=chosen.cache,
+            progress=lambda share: progress(0.95 * share),
+        )
         lens, poses = cameras_of(answer, plan)
         predicted = predicted_by(answer)
         placed = place_by_markers(lens, poses, corners, [p.name for p in photos], settings.edge_mm)
-        metric = hold_to_markers(
-            lens, placed, corners, predicted, plan, chosen.confidence, edge_mm=settings.edge_mm, seed=settings.seed
-        ) if settings.hold_to_markers else as_predicted(lens, placed, predicted)  # fmt: skip
+        metric = (
+            hold_to_markers(
+                lens, placed, corners, predicted, plan, chosen.confidence, edge_mm=settings.edge_mm, seed=settings.seed
+            )
+            if settings.hold_to_markers
+            else as_predicted(lens, placed, predicted)
+        )
         used = tuple(p for p in range(len(photos)) if p not in placed.foreign)
         if len(used) < LEAST_PHOTOS:
             raise TooFewPhotosError(
@@ -103,9 +119,14 @@ class Mast3rBackend:
         without = [photos[p].name for p in used if metric.depths[p] is None]
         progress(1.0)
         return Reconstruction(
-            used, metric.lens, kept, maps, sparse_points(list(maps), kept), refused,
+            used,
+            metric.lens,
+            kept,
+            maps,
+            sparse_points(list(maps), kept),
+            refused,
             (LICENCE, ran("MASt3R", answer.facts, weights), *left_out("MASt3R", "the markers", without, len(used))),
-        )  # fmt: skip
+        )
 
 
 def cameras_of(answer: Answer, plan: Preparation) -> tuple[Intrinsics, tuple[Pose, ...]]:

@@ -33,9 +33,11 @@ def _whole(low: int, high: int) -> Callable[[Any], bool]:
 
 def _range(value: Any) -> bool:
     return (
-        isinstance(value, tuple) and len(value) == 3 and value[0] in ("exp", "linear", "square", "sigmoid")
+        isinstance(value, tuple)
+        and len(value) == 3
+        and value[0] in ("exp", "linear", "square", "sigmoid")
         and all(type(v) in (int, float) and not math.isnan(v) for v in value[1:])
-    )  # fmt: skip
+    )
 
 
 def _size(value: Any) -> bool:

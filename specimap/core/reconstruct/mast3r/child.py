@@ -57,10 +57,21 @@ def run(
     coarse, fine = request["schedule"]
     with TypedFailures(request["names"]):
         scene = sparse_ga.sparse_global_alignment(
-            names, list(pairs_of(arrays["images"], request["pairs"])), request["folder"] + "/cache", network,
-            subsample=request["subsample"], device=device, shared_intrinsics=True, opt_pp=False, opt_depth=True,
-            matching_conf_thr=0.0, lr1=RATES[0], niter1=coarse, lr2=RATES[1], niter2=fine,
-        )  # fmt: skip
+            names,
+            list(pairs_of(arrays["images"], request["pairs"])),
+            request["folder"] + "/cache",
+            network,
+            subsample=request["subsample"],
+            device=device,
+            shared_intrinsics=True,
+            opt_pp=False,
+            opt_depth=True,
+            matching_conf_thr=0.0,
+            lr1=RATES[0],
+            niter1=coarse,
+            lr2=RATES[1],
+            niter2=fine,
+        )
         _, depth, confidence = scene.get_dense_pts3d(clean_depth=True, subsample=request["subsample"])
     shape = arrays["images"].shape[1:3]
     found = {
@@ -75,9 +86,12 @@ def run(
     name = torch.cuda.get_device_name(device) if device.startswith("cuda") else "CPU"
     memory = torch.cuda.max_memory_allocated(device) if device.startswith("cuda") else 0
     facts = {
-        "device": name, "torch": torch.__version__, "seconds_loading": round(loaded - started, 2),
-        "seconds": round(time.monotonic() - loaded, 2), "device_memory_bytes": int(memory),
-    }  # fmt: skip
+        "device": name,
+        "torch": torch.__version__,
+        "seconds_loading": round(loaded - started, 2),
+        "seconds": round(time.monotonic() - loaded, 2),
+        "device_memory_bytes": int(memory),
+    }
     return found, facts
 
 

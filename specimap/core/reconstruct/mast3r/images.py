@@ -68,6 +68,4 @@ def plan_preparation(photo_size: tuple[int, int], longer_px: int) -> Preparation
     longer = max(photo_size)
     width, height = (round(v * longer_px / longer) for v in photo_size)
     cut_w, cut_h = (2 * (v // 2) // PATCH_PX * PATCH_PX for v in (width, height))
-    return Preparation(
-        photo_size, (width, height), width // 2 - cut_w // 2, height // 2 - cut_h // 2, (cut_w, cut_h)
-    )
+    return Preparation(photo_size, (width, height), width // 2 - cut_w // 2, height // 2 - cut_h // 2, (cut_w, cut_h))

@@ -41,9 +41,7 @@ def depth_maps(
             continue
         confidence = predicted.confidence[photo]
         sure = np.where(confidence > least_confidence, known, np.float32(0))
-        depth, certain, colour = undistorted(
-            lens, sure, bytes_of(confidence, least_confidence), images[photo]
-        )
+        depth, certain, colour = undistorted(lens, sure, bytes_of(confidence, least_confidence), images[photo])
         depth = inside_volume(depth, straight, pose.R, pose, volume)
         found = cropped_map(place, np.eye(3), straight, depth, colour, certain)
         if found is not None:
@@ -56,9 +54,7 @@ def depth_maps(
     return tuple(maps)
 
 
-def undistorted(
-    lens: Intrinsics, depth: Singles, confidence: Bytes, colour: Bytes
-) -> tuple[Singles, Bytes, Bytes]:
+def undistorted(lens: Intrinsics, depth: Singles, confidence: Bytes, colour: Bytes) -> tuple[Singles, Bytes, Bytes]:
     """The same as a lens without distortion sees them: depth along z does not change, its place does."""
     if not (lens.k1 or lens.k2):
         return depth, confidence, colour

@@ -59,9 +59,16 @@ def as_predicted(lens: Intrinsics, placed: Placed, predicted: Predicted) -> Metr
 
 
 def hold_to_markers(
-    lens: Intrinsics, placed: Placed, corners: CornersInPhotos, predicted: Predicted, plan: Preparation,
-    least_confidence: float, *, edge_mm: float, seed: int,
-) -> Metric:  # fmt: skip
+    lens: Intrinsics,
+    placed: Placed,
+    corners: CornersInPhotos,
+    predicted: Predicted,
+    plan: Preparation,
+    least_confidence: float,
+    *,
+    edge_mm: float,
+    seed: int,
+) -> Metric:
     """Adjust the cameras on the corners and fit the depths.
 
     A photo without a marker is located by its own points, which the other photos' say how to move. A photo that the
@@ -128,9 +135,13 @@ def _world(lens: Intrinsics, pose: Pose, rows: NDArray[np.intp], cols: NDArray[n
 
 
 def _moved(
-    placed: Placed, predicted: Predicted, sure: Singles, network: Intrinsics, poses: tuple[Pose, ...],
+    placed: Placed,
+    predicted: Predicted,
+    sure: Singles,
+    network: Intrinsics,
+    poses: tuple[Pose, ...],
     fits: list[Alignment | None],
-) -> Floats | None:  # fmt: skip
+) -> Floats | None:
     """The affine map (4, 3) of MASt3R's placed points to those held to the markers; None where there are too few.
 
     A wrong focal length stretches what is seen, to first order evenly.
@@ -157,9 +168,17 @@ def _moved(
 
 
 def _located(
-    photo: int, placed: Placed, predicted: Predicted, sure: Singles, network: Intrinsics, pose: Pose, move: Floats, *,
-    keep_pose: bool, seed: int,
-) -> tuple[Pose, Alignment | None]:  # fmt: skip
+    photo: int,
+    placed: Placed,
+    predicted: Predicted,
+    sure: Singles,
+    network: Intrinsics,
+    pose: Pose,
+    move: Floats,
+    *,
+    keep_pose: bool,
+    seed: int,
+) -> tuple[Pose, Alignment | None]:
     """Pose and fit of a photo by its own points, moved as the others' moved."""
     rows, cols = _pixels(sure[photo])
     if len(rows) < LEAST_POINTS:
@@ -170,9 +189,15 @@ def _located(
     if not keep_pose:
         start = cv2.Rodrigues(pose.R)[0], pose.t.reshape(3, 1).copy()
         good, rvec, tvec = cv2.solvePnP(
-            points.reshape(-1, 1, 3), np.stack([cols, rows], -1).astype(float).reshape(-1, 1, 2), network.matrix,
-            network.distortion, start[0], start[1], useExtrinsicGuess=True, flags=cv2.SOLVEPNP_ITERATIVE,
-        )  # fmt: skip
+            points.reshape(-1, 1, 3),
+            np.stack([cols, rows], -1).astype(float).reshape(-1, 1, 2),
+            network.matrix,
+            network.distortion,
+            start[0],
+            start[1],
+            useExtrinsicGuess=True,
+            flags=cv2.SOLVEPNP_ITERATIVE,
+        )
         if good and np.isfinite(rvec).all() and np.isfinite(tvec).all():
             pose = Pose(rotation_from_vector(rvec.ravel()), tvec.ravel())
     z = pose.apply(points)[:, 2]

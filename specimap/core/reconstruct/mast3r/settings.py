@@ -33,8 +33,18 @@ NEEDED = ("mast3r/cloud_opt/sparse_ga.py", "dust3r/dust3r/model.py", "dust3r/cro
 """Files that tell a whole checkout: of upstream itself and of its two submodules."""
 SOURCE = "docs/backends.md says where it comes from and under which licence."
 MODULES = (
-    "numpy", "torch", "torchvision", "roma", "scipy", "cv2", "PIL", "einops", "huggingface_hub", "trimesh", "tqdm",
-)  # fmt: skip
+    "numpy",
+    "torch",
+    "torchvision",
+    "roma",
+    "scipy",
+    "cv2",
+    "PIL",
+    "einops",
+    "huggingface_hub",
+    "trimesh",
+    "tqdm",
+)
 """What upstream's alignment imports."""
 
 MANY_PHOTOS = 30
@@ -70,10 +80,14 @@ class Mast3rSettings:
         if kind == "auto":
             kind = "complete" if count <= MANY_PHOTOS else f"swin-{WINDOW}"
         window = count if kind == "complete" else int(kind.split("-")[1])
-        return sorted({
-            (min(i, j % count), max(i, j % count))
-            for i in range(count) for j in range(i + 1, i + window + 1) if i != j % count
-        })  # fmt: skip
+        return sorted(
+            {
+                (min(i, j % count), max(i, j % count))
+                for i in range(count)
+                for j in range(i + 1, i + window + 1)
+                if i != j % count
+            }
+        )
 
 
 def settings_from_environment(environment: Mapping[str, str] = os.environ) -> Mast3rSettings:
@@ -92,9 +106,7 @@ def settings_from_environment(environment: Mapping[str, str] = os.environ) -> Ma
         except ValueError:
             value = None
         if value is None or not fits(value):
-            raise SettingsError(
-                f"{PREFIX}{name} is {text!r}.", advice=f"It takes {takes}.", setting=PREFIX + name
-            )
+            raise SettingsError(f"{PREFIX}{name} is {text!r}.", advice=f"It takes {takes}.", setting=PREFIX + name)
         return value
 
     d = Mast3rSettings()
@@ -109,11 +121,16 @@ def settings_from_environment(environment: Mapping[str, str] = os.environ) -> Ma
             "SIZE_PX", d.size_px, int, lambda v: 64 <= v <= 2048 and v % 16 == 0, "a multiple of 16, 64 to 2048"
         ),
         subsample=read("SUBSAMPLE", d.subsample, int, lambda v: v in (2, 4, 8, 16), "2, 4, 8 or 16"),
-        schedule=read("SCHEDULE", d.schedule, _schedule, lambda v: 0 < v[0] <= 10000 and 0 <= v[1] <= 10000,
-                      "two numbers of iterations, such as 300,300"),
+        schedule=read(
+            "SCHEDULE",
+            d.schedule,
+            _schedule,
+            lambda v: 0 < v[0] <= 10000 and 0 <= v[1] <= 10000,
+            "two numbers of iterations, such as 300,300",
+        ),
         confidence=read("CONFIDENCE", d.confidence, float, lambda v: 1 <= v < 100, "a number from 1 to 100"),
         cache=named_path(PREFIX + "CACHE", environment),
-    )  # fmt: skip
+    )
 
 
 def _matches(pattern: str) -> Callable[[str], bool]:
