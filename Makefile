@@ -19,7 +19,7 @@ help:
 	@echo "make learned add PyTorch and the learned features"
 	@echo "make demo    set up, then run samples/ through a service of its own into $(DEMO_OUT)"
 	@echo "make test    set up, with the learned features, then run the tests"
-	@echo "make lint    ruff and mypy"
+	@echo "make lint    formatting (ruff format .), ruff and mypy"
 	@echo "make bench   time, memory and accuracy beside the published figures"
 	@echo "make bench-service   the same for the service, beside nginx"
 	@echo "make check-images    every install step of docker/ in a bare root folder (root, network)"
@@ -59,6 +59,7 @@ test: setup learned
 	$(RUN)/python -m pytest -n $(TEST_PROCESSES) --dist worksteal
 
 lint: setup
+	$(RUN)/ruff format --check .
 	$(RUN)/ruff check .
 	$(RUN)/mypy
 

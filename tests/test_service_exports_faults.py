@@ -42,7 +42,7 @@ def slow(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[], int]:
     script = tmp_path / "slow.py"
     script.write_text(
         "import os, pathlib, sys, time\n"
-        "pathlib.Path(sys.argv[3]).write_bytes(b'half')\n"
+        "pathlib.Path(sys.argv[-3]).write_bytes(b'half')\n"
         f"pathlib.Path({str(tmp_path)!r}, 'pid-' + str(os.getpid())).touch()\n"
         "time.sleep(60)\n"
     )
