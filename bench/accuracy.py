@@ -14,9 +14,9 @@ from bench.enlarge import enlarge
 from bench.measure import Measured, measure
 from bench.real import APPLE, bench_apple
 from bench.sample import SAMPLE
-from specimap.core.accuracy import TruthComparison
-from specimap.core.evidence.truth import evenly, judge
-from specimap.core.phantom import PhantomSettings, write_phantom
+from specimap_core.truth.judge import TruthComparison, judge
+from specimap_validation.phantom import PhantomSettings, write_phantom
+from specimap_validation.photo_subsets import evenly
 
 
 @dataclass(frozen=True)

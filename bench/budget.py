@@ -14,19 +14,19 @@ from scipy.ndimage import map_coordinates
 
 from bench.sample import SAMPLE
 from bench.scene import Scene, scaled_maps
-from specimap.core.acquisition import read_photos
-from specimap.core.evidence.truth import SPECIMEN
-from specimap.core.geometry import Floats, Pose, View, fit_similarity
-from specimap.core.phantom import load_truth
-from specimap.core.photofolder import photo_paths
-from specimap.core.pipeline.clock import Clock
-from specimap.core.pipeline.outputs import Outputs
-from specimap.core.pipeline.settings import PipelineSettings
-from specimap.core.pipeline.stages import adjust_stage, mesh_of, reconstruct_stage
-from specimap.core.raycast import RayCaster
-from specimap.core.reconstruct.dense import dense_depth
-from specimap.core.reconstruct.volume import volume_over
-from specimap.core.surface import Mesh
+from specimap_core.geometry.cameras import Floats, Pose, View, fit_similarity
+from specimap_core.photos.folder import photo_paths
+from specimap_core.photos.reading import read_photos
+from specimap_core.pipeline.clock import Clock
+from specimap_core.pipeline.outputs import Outputs
+from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.pipeline.stages import adjust_stage, mesh_of, reconstruct_stage
+from specimap_core.reconstruct.dense.multi_view import dense_depth
+from specimap_core.reconstruct.dense.volume import volume_over
+from specimap_core.surface.fusion import Mesh
+from specimap_core.surface.raycast import RayCaster
+from specimap_core.truth.judge import SPECIMEN
+from specimap_validation.phantom import load_truth
 
 
 @dataclass(frozen=True)

@@ -14,18 +14,18 @@ from dataclasses import asdict
 from pathlib import Path
 
 from bench.tracing import tracing
-from specimap.core.cube import open_cube
-from specimap.core.jsontext import json_text
-from specimap.core.photofolder import photo_paths
-from specimap.core.pipeline import Inputs, Outputs, run_pipeline
-from specimap.core.pipeline.artefacts import load_stage1, load_stage2
-from specimap.core.pipeline.clock import Clock
-from specimap.core.pipeline.finish import register_and_write
-from specimap.core.pipeline.outputs import prepare_folder
-from specimap.core.pipeline.settings import PipelineSettings, settings_from
-from specimap.core.pipeline.stages import adjust_stage, reconstruct_stage, render_stage
-from specimap.core.raycast import RayCaster
-from specimap.core.report import Report
+from specimap_core.cube import open_cube
+from specimap_core.json_text import json_text
+from specimap_core.photos.folder import photo_paths
+from specimap_core.pipeline.artefacts import load_stage1, load_stage2
+from specimap_core.pipeline.clock import Clock
+from specimap_core.pipeline.outputs import Inputs, Outputs, prepare_folder
+from specimap_core.pipeline.register_stage import register_and_write
+from specimap_core.pipeline.run import run_pipeline
+from specimap_core.pipeline.settings import PipelineSettings, settings_from
+from specimap_core.pipeline.stages import adjust_stage, reconstruct_stage, render_stage
+from specimap_core.report.model import Report
+from specimap_core.surface.raycast import RayCaster
 
 
 class _Steps:

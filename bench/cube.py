@@ -13,7 +13,7 @@ from bench.bound import bound_seconds
 from bench.measure import measure
 from bench.sample import SAMPLE, run_sample
 from bench.synthetic import BANDS, COLS, ROWS, enlarge, write_envi_cube
-from specimap.core.cloud import Cloud
+from specimap_core.cloud import Cloud
 
 KINDS = [(dtype, interleave) for dtype in ("uint16", "float32") for interleave in ("bsq", "bil", "bip")]
 TARGET_S = {"uint16": 4.0, "float32": 6.0}

@@ -11,26 +11,21 @@ import numpy as np
 from rich.console import Console
 
 from bench.service.sheet import NONE, Sheet
-from specimap.core.acquisition import AcquisitionSettings, Photo, read_photos
-from specimap.core.errors import SpecimapError
-from specimap.core.geometry import Floats, Pose, fit_similarity
-from specimap.core.phantom import PhantomSettings, write_phantom
-from specimap.core.phantom.truth import Truth
-from specimap.core.phantom.views import photo_views
-from specimap.core.photofolder import photo_paths
-from specimap.core.raycast import RayCaster
-from specimap.core.reconstruct.backend import (
-    CornersInPhotos,
-    ReconstructSettings,
-    corners_in_photos,
-    detect_in_photos,
-)
-from specimap.core.reconstruct.dense import dense_depth
-from specimap.core.reconstruct.depth import DepthSettings
-from specimap.core.reconstruct.features import aliked_missing
-from specimap.core.reconstruct.posing import Posed, pose_photos
-from specimap.core.reconstruct.volume import volume_over
-from specimap.core.surface import Mesh, SurfaceSettings, fuse, vertex_normals
+from specimap_core.errors import SpecimapError
+from specimap_core.geometry.cameras import Floats, Pose, fit_similarity
+from specimap_core.photos.folder import photo_paths
+from specimap_core.photos.reading import AcquisitionSettings, Photo, read_photos
+from specimap_core.reconstruct.backend import CornersInPhotos, ReconstructSettings, corners_in_photos, detect_in_photos
+from specimap_core.reconstruct.dense.depth_map import DepthSettings
+from specimap_core.reconstruct.dense.multi_view import dense_depth
+from specimap_core.reconstruct.dense.volume import volume_over
+from specimap_core.reconstruct.features.choice import aliked_missing
+from specimap_core.reconstruct.poses import Posed, pose_photos
+from specimap_core.surface.fusion import Mesh, SurfaceSettings, fuse, vertex_normals
+from specimap_core.surface.raycast import RayCaster
+from specimap_core.truth.truth_file import Truth
+from specimap_validation.phantom import PhantomSettings, write_phantom
+from specimap_validation.phantom.views import photo_views
 
 PHOTOS = 16
 WITH_MARKERS = 4

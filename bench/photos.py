@@ -12,7 +12,7 @@ from bench.growth import exponents, exponents_in_words
 from bench.machine import load
 from bench.measure import measure
 from bench.service.sheet import Sheet, reached
-from specimap.core.phantom import PhantomSettings, write_phantom
+from specimap_validation.phantom import PhantomSettings, write_phantom
 
 COUNTS = (12, 24, 48, 96)
 TARGET = 1.3

@@ -9,12 +9,12 @@ from pathlib import Path
 
 from rich.console import Console
 
-from specimap.core.photofolder import photo_paths
-from specimap.core.pipeline.clock import Clock
-from specimap.core.pipeline.finish import triangulated_edges
-from specimap.core.pipeline.outputs import Outputs
-from specimap.core.pipeline.settings import settings_from
-from specimap.core.pipeline.stages import adjust_stage, reconstruct_stage
+from specimap_core.photos.folder import photo_paths
+from specimap_core.pipeline.clock import Clock
+from specimap_core.pipeline.outputs import Outputs
+from specimap_core.pipeline.register_stage import triangulated_edges
+from specimap_core.pipeline.settings import settings_from
+from specimap_core.pipeline.stages import adjust_stage, reconstruct_stage
 
 APPLE = "real_aruco_apple"
 EDGE_MM = 33.0

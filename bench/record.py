@@ -6,8 +6,8 @@ import datetime
 from pathlib import Path
 
 from bench.machine import describe
-from specimap.core.files import write_text
-from specimap.core.jsontext import json_text
+from specimap_core.atomic import write_text
+from specimap_core.json_text import json_text
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bench.measure import Cost, Measured, measure
-from specimap.core.evidence.published import CORNER_2D_WORDS, CORNER_3D_WORDS, STAGE_SECONDS_WORDS
+from specimap_core.report.published import CORNER_2D_WORDS, CORNER_3D_WORDS, STAGE_SECONDS_WORDS
 
 SAMPLE = Path(__file__).resolve().parent.parent / "samples"
 

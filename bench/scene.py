@@ -8,19 +8,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap.core.accuracy import CornersInCube
-from specimap.core.cube import open_cube
-from specimap.core.evidence.truth import SPECIMEN
-from specimap.core.geometry import Floats, Intrinsics, Pose, View, fit_similarity
-from specimap.core.phantom.truth import Truth
-from specimap.core.pipeline.artefacts import Stage1, Stage2
-from specimap.core.pipeline.finish import corners_in_cube
-from specimap.core.pipeline.settings import PipelineSettings
-from specimap.core.raycast import RayCaster
-from specimap.core.reconstruct.depth import DepthMap
-from specimap.core.register.cube_markers import find_markers
-from specimap.core.register.register import Placement, place_by_camera
-from specimap.core.register.settle import settle_camera
+from specimap_core.cube import open_cube
+from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, View, fit_similarity
+from specimap_core.pipeline.artefacts import Stage1, Stage2
+from specimap_core.pipeline.register_stage import corners_in_cube
+from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.reconstruct.dense.depth_map import DepthMap
+from specimap_core.register.accuracy import CornersInCube
+from specimap_core.register.camera_refinement import settle_camera
+from specimap_core.register.cube_markers import find_markers
+from specimap_core.register.placement import Placement, place_by_camera
+from specimap_core.surface.raycast import RayCaster
+from specimap_core.truth.judge import SPECIMEN
+from specimap_core.truth.truth_file import Truth
 
 
 class Scene:

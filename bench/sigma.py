@@ -15,15 +15,23 @@ from scipy.optimize import minimize
 
 from bench.scene import Scene, scaled_maps
 from bench.service.sheet import Sheet
-from specimap.core.geometry import Floats
-from specimap.core.phantom import PhantomSettings, load_truth, write_phantom
-from specimap.core.photofolder import photo_paths
-from specimap.core.pipeline.clock import Clock
-from specimap.core.pipeline.outputs import Outputs
-from specimap.core.pipeline.settings import PipelineSettings
-from specimap.core.pipeline.stages import adjust_stage, mesh_of, reconstruct_stage
-from specimap.core.raycast import RayCaster
-from specimap.core.uncertainty import SHARES, Evidence, Shares, bend_mm, point_sigma, step_height, vertex_scatter
+from specimap_core.geometry.cameras import Floats
+from specimap_core.photos.folder import photo_paths
+from specimap_core.pipeline.clock import Clock
+from specimap_core.pipeline.outputs import Outputs
+from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.pipeline.stages import adjust_stage, mesh_of, reconstruct_stage
+from specimap_core.surface.raycast import RayCaster
+from specimap_core.surface.uncertainty import (
+    SHARES,
+    Evidence,
+    Shares,
+    bend_mm,
+    point_sigma,
+    step_height,
+    vertex_scatter,
+)
+from specimap_validation.phantom import PhantomSettings, load_truth, write_phantom
 
 CUBE: dict[str, Any] = {"bands": 8, "wavelength_nm": (400.0, 1000.0)}
 SETTING = {

@@ -27,16 +27,16 @@ from PIL import Image
 
 from bench.bound import bound_seconds
 from bench.child import parsed, settings_of
-from specimap.core.cloud import Cloud
-from specimap.core.cube import open_cube
-from specimap.core.jsontext import json_text
-from specimap.core.native import open3d
-from specimap.core.photofolder import photo_paths
-from specimap.core.pipeline import stages
-from specimap.core.pipeline.clock import Clock
-from specimap.core.pipeline.outputs import Outputs, prepare_folder
-from specimap.core.refine import refine_mesh
-from specimap.core.surface import BLOCK_VOXELS, FIRST_BLOCKS, fuse
+from specimap_core.cloud import Cloud
+from specimap_core.cube import open_cube
+from specimap_core.json_text import json_text
+from specimap_core.native import open3d
+from specimap_core.photos.folder import photo_paths
+from specimap_core.pipeline import stages
+from specimap_core.pipeline.clock import Clock
+from specimap_core.pipeline.outputs import Outputs, prepare_folder
+from specimap_core.surface.fusion import BLOCK_VOXELS, FIRST_BLOCKS, fuse
+from specimap_core.surface.refinement import refine_mesh
 
 TRIES = 3
 EVERY = 16

@@ -23,7 +23,7 @@ from bench.tracing import TARGETS
 START, END, REST = "start-up", "process end", "rest"
 ORDER = (START, *dict.fromkeys(target.step for target in TARGETS), REST, END)
 IMPORTS = "import bench.child; from bench.tracing import tracing; tracing().__enter__()"
-OWN = ("specimap", "bench")
+OWN = ("specimap_core", "specimap_infra", "specimap_workers", "specimap_cli", "specimap_validation", "bench")
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap.core.cube import open_cube
-from specimap.core.files import atomic_path, write_text
+from specimap_core.atomic import atomic_path, write_text
+from specimap_core.cube import open_cube
 
 ROWS, COLS, BANDS = 1024, 1280, 290
 NOISE = 50

@@ -19,7 +19,7 @@ from bench.service.parts import PARTS, in_markdown
 from bench.service.sheet import Sheet
 from bench.sigma import sheet_sigma
 from bench.steps import sheet_steps
-from specimap.core.evidence.marks import put
+from specimap_validation.page_marks import put
 
 ROOT = Path(__file__).resolve().parent.parent
 REAL = "apple"

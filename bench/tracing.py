@@ -29,23 +29,23 @@ class Target:
     splits: bool = False
 
 
-_RUN, _STAGES, _FINISH = (f"specimap.core.pipeline.{name}" for name in ("run", "stages", "finish"))
-_RECONSTRUCT = "specimap.core.reconstruct"
+_RUN, _STAGES, _FINISH = (f"specimap_core.pipeline.{name}" for name in ("run", "stages", "register_stage"))
+_RECONSTRUCT = "specimap_core.reconstruct"
 
 TARGETS = (
     Target("cube opened, inspected", _RUN, "open_cube"),
     Target("cube opened, inspected", _RUN, "inspect"),
-    Target("cube opened, inspected", "specimap.core.cube.model", "Cube.mean_image"),
+    Target("cube opened, inspected", "specimap_core.cube.model", "Cube.mean_image"),
     Target("reading photos", _STAGES, "read_photos"),
     Target("marker detection", _STAGES, "detect_in_photos"),
     Target("marker detection", _STAGES, "corners_in_photos"),
     Target("solve", _STAGES, "settle_breathing"),
-    Target("solve", f"{_RECONSTRUCT}.colmap", "pose_photos"),
+    Target("solve", f"{_RECONSTRUCT}.backends.colmap", "pose_photos"),
     Target("solve", _STAGES, "adjust"),
-    Target("features", f"{_RECONSTRUCT}.posing", "reach_by_places", splits=True),
-    Target("features", f"{_RECONSTRUCT}.posing", "reach_by_motion", splits=True),
-    Target("dense matching", f"{_RECONSTRUCT}.colmap", "measure_depth"),
-    Target("Open3D waited for", "specimap.core.surface", "open3d", splits=True),
+    Target("features", f"{_RECONSTRUCT}.poses", "reach_by_places", splits=True),
+    Target("features", f"{_RECONSTRUCT}.poses", "reach_by_motion", splits=True),
+    Target("dense matching", f"{_RECONSTRUCT}.backends.colmap", "measure_depth"),
+    Target("Open3D waited for", "specimap_core.surface.fusion", "open3d", splits=True),
     Target("fusion", _STAGES, "fuse"),
     Target("refinement", _STAGES, "refine_mesh"),
     Target("sigma", _STAGES, "mesh_sigma"),
@@ -56,7 +56,7 @@ TARGETS = (
     Target("render", _STAGES, "render_grid"),
     Target("cube markers", _FINISH, "find_markers", splits=True),
     Target("registration", _FINISH, "_register"),
-    Target("motion check", "specimap.core.register.settle", "choose_camera", splits=True),
+    Target("motion check", "specimap_core.register.camera_refinement", "choose_camera", splits=True),
     Target("mesh written", _FINISH, "write_mesh_ply"),
     Target("cloud written", _FINISH, "write_cloud"),
     Target("preview", _FINISH, "write_preview"),

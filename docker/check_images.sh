@@ -87,7 +87,7 @@ assert status == 0, f"ended with status {status}: " + open("/tmp/log").read()'
 
 check_service() {
     in_image "$1" python -c '
-import importlib.util, specimap.service.app, specimap.infra.migrate, cv2, h5py, pillow_heif, pyarrow, tifffile
+import importlib.util, specimap_service.app, specimap_infra.migrate, cv2, h5py, pillow_heif, pyarrow, tifffile
 heavy = [name for name in ("open3d", "pycolmap", "embreex") if importlib.util.find_spec(name)]
 assert not heavy, heavy'
     starts_and_ends "$1" <<'END'
@@ -98,7 +98,7 @@ END
 
 check_worker() {
     in_image "$1" python -c '
-import cv2, embreex, open3d, pycolmap, scipy, tensorstore, specimap.workers.worker
+import cv2, embreex, open3d, pycolmap, scipy, tensorstore, specimap_workers.worker
 print("COLMAP", pycolmap.__version__, "with CUDA" if pycolmap.has_cuda else "without CUDA")'
     starts_and_ends "$1" <<'END'
 import os, sqlite3

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from specimap.core.cube import open_cube
-from specimap.core.files import atomic_path
-from specimap.core.phantom import write_cube
+from specimap_core.atomic import atomic_path
+from specimap_core.cube import open_cube
+from specimap_validation.phantom import write_cube
 
 # The crop is symmetric about the cube's centre, so that the principal point stays in the middle of the image; it
 # keeps all four cards with a margin. Pixels are not binned: their centres stay where they were.
@@ -33,7 +33,7 @@ def reduce_cube(source: Path, target: Path) -> None:
 
 
 def reduce_truth(source: Path, target: Path, photo_size: tuple[int, int]) -> None:
-    """The keys of ``truth.npz`` that :func:`specimap.core.phantom.load_truth` reads, cropped as the cube is.
+    """The keys of ``truth.npz`` that :func:`specimap_validation.phantom.load_truth` reads, cropped as the cube is.
 
     ``photo_size``: width, height.
     """

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from specimap.core.reconstruct.learned.environment import BACKEND_VARIABLES
-from specimap.core.reconstruct.mast3r.settings import NEEDED
+from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES
+from specimap_core.reconstruct.backends.mast3r.settings import NEEDED
 
 
 def no_variables(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scenes import OnDisk
 
-from specimap.core.geometry import Floats, View
+from scenes import OnDisk
+from specimap_core.geometry.cameras import Floats, View
 
 TRAY_GREY = (120, 120, 120)
 

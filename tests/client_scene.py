@@ -11,6 +11,7 @@ from typing import Any
 
 import httpx
 import pytest
+
 from result_scene import Result, put_result
 from service_scene import ALL_SCOPES, Running, serving
 from specimap_client import Client, Cloud, Retries, _retries

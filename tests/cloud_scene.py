@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap.core.cloud import CloudPoints
-from specimap.core.geometry import Array
+from specimap_core.cloud import CloudPoints
+from specimap_core.geometry.cameras import Array
 
 
 @dataclass(eq=False)

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
-from true_depth import true_depth
 
-from specimap.core.geometry import View
-from specimap.core.phantom import Phantom, PhantomSettings
-from specimap.core.reconstruct.da3.prepare import plan_preparation
-from specimap.core.reconstruct.learned.process import run_child
+from specimap_core.geometry.cameras import View
+from specimap_core.reconstruct.backends.da3.prepare import plan_preparation
+from specimap_core.sandbox.process import run_child
+from specimap_validation.phantom import Phantom, PhantomSettings
+from true_depth import true_depth
 
 EDGE_PX, NOISE_PX = 1.0, 20.0
 FACTS = '{"variant": "oracle", "device": "cpu", "torch": "none", "seconds": 0.0}'

@@ -12,8 +12,8 @@ import psycopg
 import pytest
 from psycopg import sql
 
-from specimap.infra.database import Database
-from specimap.infra.migrate import migrate
+from specimap_infra.database import Database
+from specimap_infra.migrate import migrate
 
 
 def postgres_server() -> psycopg.Connection:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+
 from result_scene import Result
 from service_scene import Running
 

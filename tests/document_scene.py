@@ -9,14 +9,14 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
+
 from cloud_scene import FakeCube, counts, scene
 from result_scene import report_of
-
-from specimap.core.cloud import Cloud, CloudPoints
-from specimap.core.cloud.writer import write_cloud
-from specimap.core.photosheet import contact_sheet
-from specimap.core.preview import write_preview
-from specimap.core.report import CubeCorners, LeaveOneOut, MethodFigures, PhotoCorners, Report
+from specimap_core.cloud import Cloud, CloudPoints
+from specimap_core.cloud.preview import write_preview
+from specimap_core.cloud.writer import write_cloud
+from specimap_core.photos.contact_sheet import contact_sheet
+from specimap_core.report.model import CubeCorners, LeaveOneOut, MethodFigures, PhotoCorners, Report
 
 
 def square(x: float, y: float, edge: float = 40.0) -> list[float]:

@@ -6,8 +6,7 @@ from typing import Any
 
 from result_scene import Result
 from service_scene import Running
-
-from specimap.workers.exports import run_export
+from specimap_workers.exports import run_export
 
 
 def address(result: Result, format: str) -> str:

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap.core.acquisition import Photo, sharpness_of
-from specimap.core.geometry import Floats, Pose, View, fit_similarity, skew
-from specimap.core.phantom import PhantomSettings
-from specimap.core.phantom.phantom import Phantom
-from specimap.core.reconstruct.backend import CornersInPhotos, corners_in_photos, detect_in_photos
+from specimap_core.geometry.cameras import Floats, Pose, View, fit_similarity, skew
+from specimap_core.photos.reading import Photo, sharpness_of
+from specimap_core.reconstruct.backend import CornersInPhotos, corners_in_photos, detect_in_photos
+from specimap_validation.phantom import PhantomSettings
+from specimap_validation.phantom.phantom import Phantom
 
 RING = slice(10, 20)
 """Of 24 photos the ten at 56 degrees, about 20 degrees apart as seen from the specimen."""

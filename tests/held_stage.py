@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import Any, TextIO
 
-from specimap.workers import stage_main
+from specimap_workers import stage_main
 
 FOLDER = Path(os.environ["HOLD_FOLDER"])
 real = stage_main._run

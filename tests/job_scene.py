@@ -7,11 +7,11 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from specimap.infra.database import Database
-from specimap.infra.ids import new_id
-from specimap.infra.job_models import JobSettings
-from specimap.infra.jobs import append_event
-from specimap.infra.models import Acquisition, Job, JobEvent, StoredFile
+from specimap_infra.database import Database
+from specimap_infra.ids import new_id
+from specimap_infra.job_schemas import JobSettings
+from specimap_infra.jobs import append_event
+from specimap_infra.tables import Acquisition, Job, JobEvent, StoredFile
 
 CUBE = ("cube.hdr", "cube.raw")
 EXECUTOR = "host:0:one"

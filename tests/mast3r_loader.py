@@ -31,7 +31,7 @@ def run(request: dict[str, Any], arrays: dict[str, Any], step: Any) -> Any:
 
     import torch
 
-    from specimap.core.reconstruct.mast3r import checkpoint, child
+    from specimap_core.reconstruct.backends.mast3r import checkpoint, child
 
     stand_in()
     child.use_checkout(Path(request["home"]))

@@ -1,10 +1,10 @@
 """A script for the child's process: upstream's alignment with a network that knows the answer.
 
-It runs what :mod:`specimap.core.reconstruct.mast3r.child` runs, upstream's code included, and puts an oracle in the
-network's place: exact points in the first photo's frame, even confidence, and descriptors that are alike where the
-points are near. ``ORACLE`` in the environment names an archive with ``images`` (N, H, W, 3) as the network gets them,
-``points`` (N, H, W, 3) in the world, ``poses`` (N, 3, 4) ``cam_from_world``, ``sure`` (N, H, W) from 0, where nothing
-shows, to 1.
+It runs what :mod:`specimap_core.reconstruct.backends.mast3r.child` runs, upstream's code included, and puts an oracle
+in the network's place: exact points in the first photo's frame, even confidence, and descriptors that are alike where
+the points are near. ``ORACLE`` in the environment names an archive with ``images`` (N, H, W, 3) as the network gets
+them, ``points`` (N, H, W, 3) in the world, ``poses`` (N, 3, 4) ``cam_from_world``, ``sure`` (N, H, W) from 0, where
+nothing shows, to 1.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ class Oracle(torch.nn.Module):  # type: ignore[misc]
 
 
 def run(request: dict[str, Any], arrays: dict[str, Any], step: Any) -> Any:
-    """As :func:`specimap.core.reconstruct.mast3r.child.run`, with the oracle for a network."""
-    from specimap.core.reconstruct.mast3r import child
+    """As :func:`specimap_core.reconstruct.backends.mast3r.child.run`, with the oracle for a network."""
+    from specimap_core.reconstruct.backends.mast3r import child
 
     stand_in()
     child.load_network = lambda request: Oracle(os.environ["ORACLE"])

@@ -12,8 +12,8 @@ from mast3r_torchvision import stand_in
 
 
 def run(request: dict[str, Any], arrays: dict[str, Any], step: Any) -> Any:
-    """As :func:`specimap.core.reconstruct.mast3r.child.run`."""
-    from specimap.core.reconstruct.mast3r import child
+    """As :func:`specimap_core.reconstruct.backends.mast3r.child.run`."""
+    from specimap_core.reconstruct.backends.mast3r import child
 
     stand_in()
     return child.run(request, arrays, step)

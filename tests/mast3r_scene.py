@@ -11,23 +11,23 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from specimap.core.acquisition import AcquisitionSettings, Photo, read_photos
-from specimap.core.adjust import AdjustSettings, Form, adjust
-from specimap.core.geometry import Array, Floats, Intrinsics, Pose, View, fit_similarity
-from specimap.core.phantom import PhantomSettings
-from specimap.core.phantom.phantom import Phantom
-from specimap.core.phantom.truth import Truth
-from specimap.core.photofolder import photo_paths
-from specimap.core.reconstruct.backend import (
+from specimap_core.bundle_adjust.adjust import AdjustSettings, Form, adjust
+from specimap_core.geometry.cameras import Array, Floats, Intrinsics, Pose, View, fit_similarity
+from specimap_core.photos.folder import photo_paths
+from specimap_core.photos.reading import AcquisitionSettings, Photo, read_photos
+from specimap_core.reconstruct.backend import (
     CornersInPhotos,
     Reconstruction,
     ReconstructSettings,
     corners_in_photos,
     detect_in_photos,
 )
-from specimap.core.reconstruct.mast3r.backend import Mast3rBackend
-from specimap.core.reconstruct.mast3r.images import Preparation, plan_preparation
-from specimap.core.reconstruct.mast3r.settings import NEEDED, Mast3rSettings
+from specimap_core.reconstruct.backends.mast3r.backend import Mast3rBackend
+from specimap_core.reconstruct.backends.mast3r.images import Preparation, plan_preparation
+from specimap_core.reconstruct.backends.mast3r.settings import NEEDED, Mast3rSettings
+from specimap_core.truth.truth_file import Truth
+from specimap_validation.phantom import PhantomSettings
+from specimap_validation.phantom.phantom import Phantom
 
 SCRIPT = Path(__file__).with_name("mast3r_scripted.py")
 CLOSE_MM = 0.15

@@ -1,6 +1,7 @@
 """A script for the child's process that answers from a file, without network and without upstream's code.
 
-``ANSWER`` in the environment names an archive of the arrays that :mod:`specimap.core.reconstruct.mast3r.child` returns.
+``ANSWER`` in the environment names an archive of the arrays that
+:mod:`specimap_core.reconstruct.backends.mast3r.child` returns.
 """
 
 from __future__ import annotations

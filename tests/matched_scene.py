@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap.core.geometry import Floats, Intrinsics, Pose
-from specimap.core.phantom import Phantom, PhantomSettings
-from specimap.core.points import worth_refining
-from specimap.core.reconstruct.dense import dense_depth
-from specimap.core.reconstruct.depth import Bytes, DepthMap, DepthSettings
-from specimap.core.reconstruct.volume import Volume, volume_over
-from specimap.core.refine import pixel_footprint_mm
-from specimap.core.surface import Mesh, SurfaceSettings, fuse
+from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
+from specimap_core.reconstruct.dense.depth_map import Bytes, DepthMap, DepthSettings
+from specimap_core.reconstruct.dense.multi_view import dense_depth
+from specimap_core.reconstruct.dense.volume import Volume, volume_over
+from specimap_core.surface.fusion import Mesh, SurfaceSettings, fuse
+from specimap_core.surface.refinement import pixel_footprint_mm
+from specimap_core.surface.regions import worth_refining
+from specimap_validation.phantom import Phantom, PhantomSettings
 
 CLEAR_MM = 2.0
 """From where, off the mesh, rays look for the true surface: beyond a mesh's errors, short of most opposite flanks."""

@@ -8,16 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import sqlalchemy as sa
+
 from cloud_scene import FakeCube, counts, scene
 from service_scene import Running
-
-from specimap.core.cloud import Cloud, CloudPoints
-from specimap.core.cloud.labels import write_label
-from specimap.core.cloud.writer import write_cloud
-from specimap.core.geometry import Array
-from specimap.core.meshfile import write_mesh_ply
-from specimap.core.preview import write_preview
-from specimap.core.report import (
+from specimap_core.cloud import Cloud, CloudPoints
+from specimap_core.cloud.labels import write_label
+from specimap_core.cloud.preview import write_preview
+from specimap_core.cloud.writer import write_cloud
+from specimap_core.geometry.cameras import Array
+from specimap_core.report.model import (
     Coverage,
     CubeCameraFigures,
     EdgeLength,
@@ -31,10 +30,11 @@ from specimap.core.report import (
     SigmaFigures,
     Spread,
 )
-from specimap.core.surface import Mesh
-from specimap.infra.database import utc_now
-from specimap.infra.ids import new_id
-from specimap.infra.models import Acquisition, CloudRow, Job, LabelVersion
+from specimap_core.surface.fusion import Mesh
+from specimap_core.surface.mesh_files import write_mesh_ply
+from specimap_infra.database import utc_now
+from specimap_infra.ids import new_id
+from specimap_infra.tables import Acquisition, CloudRow, Job, LabelVersion
 
 
 @dataclass

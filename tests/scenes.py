@@ -12,15 +12,18 @@ import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from specimap.cli.app import app
-from specimap.core.cloud import Cloud
-from specimap.core.geometry import Array, Floats, Intrinsics, Pose, look_at, rotation_from_vector
-from specimap.core.phantom import PhantomSettings, load_truth, write_cube, write_phantom
-from specimap.core.phantom.truth import Truth
-from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline
-from specimap.core.report import Report
-from specimap.core.solver import MarkerScene, Observations, corners_of
-from specimap.core.surface import Mesh, vertex_normals
+from specimap_cli.app import app
+from specimap_core.bundle_adjust.solver import MarkerScene
+from specimap_core.cloud import Cloud
+from specimap_core.fiducials.observations import Observations, corners_of
+from specimap_core.geometry.cameras import Array, Floats, Intrinsics, Pose, look_at, rotation_from_vector
+from specimap_core.pipeline.outputs import Inputs
+from specimap_core.pipeline.run import run_pipeline
+from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.report.model import Report
+from specimap_core.surface.fusion import Mesh, vertex_normals
+from specimap_core.truth.truth_file import Truth
+from specimap_validation.phantom import PhantomSettings, load_truth, write_cube, write_phantom
 
 SMALL = PhantomSettings(photos=12, photo_size=384, cube_rows=128, cube_cols=160, bands=16, mesh_divisions=64)
 EDGE_MM = 6.8

@@ -16,14 +16,14 @@ import structlog
 import uvicorn
 from fastapi import FastAPI
 
-from specimap.infra.database import Database
-from specimap.infra.logs import SHARED
-from specimap.infra.migrate import migrate
-from specimap.infra.settings import ServiceSettings, load_settings
-from specimap.infra.storage import Storage
-from specimap.service.app import create_app
-from specimap.service.auth import new_key
-from specimap.service.connections import Connection
+from specimap_infra.database import Database
+from specimap_infra.logs import SHARED
+from specimap_infra.migrate import migrate
+from specimap_infra.settings import ServiceSettings, load_settings
+from specimap_infra.storage import Storage
+from specimap_service.app import create_app
+from specimap_service.auth.keys import new_key
+from specimap_service.connections import Connection
 
 ALL_SCOPES = ("upload", "read", "label", "admin")
 

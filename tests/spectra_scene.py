@@ -10,12 +10,12 @@ from typing import Any
 import httpx
 import numpy as np
 import pyarrow as pa
+
 from cloud_scene import FakeCube, counts, scene
 from result_scene import put_result
 from service_scene import serving
-
-from specimap.core.cloud import Cloud
-from specimap.service.answers import BATCH
+from specimap_core.cloud import Cloud
+from specimap_service.array_responses import BATCH
 
 ROWS, COLS, BANDS = 160, 140, 5
 

@@ -12,9 +12,9 @@ import pytest
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
-from specimap.core.acquisition import AcquisitionSettings, read_photo, read_photos
-from specimap.core.errors import NotFoundError, PhotoUnreadableError, TooFewPhotosError
-from specimap.core.photofolder import photo_paths
+from specimap_core.errors import NotFoundError, PhotoUnreadableError, TooFewPhotosError
+from specimap_core.photos.folder import photo_paths
+from specimap_core.photos.reading import AcquisitionSettings, read_photo, read_photos
 
 SETTINGS = AcquisitionSettings(working_px=160, least_photos=3)
 

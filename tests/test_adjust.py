@@ -6,13 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import EDGE_MM, marker_scene
 
-from specimap.core.adjust import Adjusted, AdjustSettings, Form, adjust, triangulate
-from specimap.core.errors import MarkerGeometryError
-from specimap.core.geometry import Floats, Pose, fit_similarity, rotation_from_vector
-from specimap.core.layout import edge_lengths, marker_frame, rigid_square
-from specimap.core.solver import MarkerScene, Observations
+from scenes import EDGE_MM, marker_scene
+from specimap_core.bundle_adjust.adjust import Adjusted, AdjustSettings, Form, adjust
+from specimap_core.bundle_adjust.solver import MarkerScene
+from specimap_core.errors import MarkerGeometryError
+from specimap_core.fiducials.layout import edge_lengths, marker_frame, rigid_square
+from specimap_core.fiducials.observations import Observations
+from specimap_core.fiducials.triangulation import triangulate
+from specimap_core.geometry.cameras import Floats, Pose, fit_similarity, rotation_from_vector
 
 IDS = (3, 5, 8, 11)
 

@@ -10,12 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from feature_scene import Ring, angle_deg, epipolar_px, photo_of, ring
 
-from specimap.core.errors import BackendUnavailableError
-from specimap.core.geometry import Pose
-from specimap.core.reconstruct.features import FeatureKind, Features, aliked_missing, feature_kind
-from specimap.core.reconstruct.locating import Locator
+from feature_scene import Ring, angle_deg, epipolar_px, photo_of, ring
+from specimap_core.errors import BackendUnavailableError
+from specimap_core.geometry.cameras import Pose
+from specimap_core.reconstruct.features.base import FeatureKind, Features
+from specimap_core.reconstruct.features.choice import aliked_missing, feature_kind
+from specimap_core.reconstruct.resection import Locator
 
 needs_aliked = pytest.mark.skipif(bool(aliked_missing()), reason="the packages of make learned are not installed")
 TARGET = np.array([0.0, 0.0, 3.0])
@@ -84,8 +85,8 @@ def test_a_photo_is_located_however_it_was_held(low: Ring, aliked: FeatureKind, 
 @needs_aliked
 def test_fused_attention_computes_what_the_package_does() -> None:
     torch = importlib.import_module("torch")
-    fused = importlib.import_module("specimap.core.reconstruct.attention").FusedCross
-    package = importlib.import_module("specimap.core.reconstruct.aliked")._package()
+    fused = importlib.import_module("specimap_core.reconstruct.features.attention").FusedCross
+    package = importlib.import_module("specimap_core.reconstruct.features.aliked")._package()
     block = sys.modules[package.LightGlue.__module__].CrossBlock(32, 4, True)
     rng = np.random.default_rng(0)
     x0, x1 = (torch.from_numpy(rng.standard_normal((1, n, 32)).astype(np.float32)) for n in (50, 70))
@@ -99,7 +100,7 @@ def test_fused_attention_computes_what_the_package_does() -> None:
 
 @needs_aliked
 def test_turning_there_and_back() -> None:
-    module = importlib.import_module("specimap.core.reconstruct.aliked")
+    module = importlib.import_module("specimap_core.reconstruct.features.aliked")
     xy = np.random.default_rng(0).uniform(0, 50, (20, 2))
     for turns in range(4):
         size = (80, 60) if turns % 2 else (60, 80)
@@ -112,7 +113,7 @@ def test_turning_there_and_back() -> None:
 
 @needs_aliked
 def test_weights_are_read_as_tensors_never_as_objects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    module = importlib.import_module("specimap.core.reconstruct.aliked")
+    module = importlib.import_module("specimap_core.reconstruct.features.aliked")
     package = module._package()
     trace = tmp_path / "ran"
 
@@ -129,7 +130,7 @@ def test_weights_are_read_as_tensors_never_as_objects(tmp_path: Path, monkeypatc
 
 @needs_aliked
 def test_missing_weights_are_refused_not_fetched(monkeypatch: pytest.MonkeyPatch) -> None:
-    module = importlib.import_module("specimap.core.reconstruct.aliked")
+    module = importlib.import_module("specimap_core.reconstruct.features.aliked")
     monkeypatch.setattr(module, "WEIGHTS", ("absent.pth",))
     with pytest.raises(BackendUnavailableError, match=r"absent\.pth") as refused:
         module._networks.__wrapped__()
@@ -138,7 +139,7 @@ def test_missing_weights_are_refused_not_fetched(monkeypatch: pytest.MonkeyPatch
 
 def test_torch_stays_out_unless_aliked_is_asked_for() -> None:
     code = (
-        "import sys; from specimap.core.reconstruct import posing, features; features.feature_kind('sift', 1); "
+        "import sys; from specimap_core.reconstruct import posing, features; features.feature_kind('sift', 1); "
         "features.check_features('auto'); print('torch' in sys.modules)"
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)

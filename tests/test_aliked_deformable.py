@@ -8,10 +8,10 @@ import sys
 import numpy as np
 import pytest
 
-from specimap.core.geometry import Array, Floats
+from specimap_core.geometry.cameras import Array, Floats
 
 torch = pytest.importorskip("torch", reason="the packages of specimap[learned] are not installed")
-deformable = importlib.import_module("specimap.core.reconstruct.deformable")
+deformable = importlib.import_module("specimap_core.reconstruct.features.deformable")
 
 B, C, D, H, W = 2, 3, 4, 9, 11
 ROUNDING = 2e-5

@@ -10,11 +10,13 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scenes import Finished, OnDisk, cube_with, run_refused, tree_of, xyz_image
 
-from specimap.core.cube import open_cube
-from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline
-from specimap.core.report import Report
+from scenes import Finished, OnDisk, cube_with, run_refused, tree_of, xyz_image
+from specimap_core.cube import open_cube
+from specimap_core.pipeline.outputs import Inputs
+from specimap_core.pipeline.run import run_pipeline
+from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.report.model import Report
 
 Values = NDArray[np.uint16]
 

@@ -8,9 +8,9 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from scenes import Finished, OnDisk, run_refused, specimap, tree_of
 
-from specimap.core.errors import PhotosNotConnectedError, SpecimapError
+from scenes import Finished, OnDisk, run_refused, specimap, tree_of
+from specimap_core.errors import PhotosNotConnectedError, SpecimapError
 
 # ---- settings, refused before anything is read ----------------------------------------------------------
 
@@ -76,7 +76,7 @@ def test_a_disk_that_refuses_leaves_the_earlier_results(
     code: str,
     step: str,
 ) -> None:
-    from specimap.core.pipeline import finish
+    from specimap_core.pipeline import register_stage
 
     out = finished.copy_to(tmp_path / "out")
     before = tree_of(out)
@@ -85,7 +85,7 @@ def test_a_disk_that_refuses_leaves_the_earlier_results(
         raise OSError(number, os.strerror(number))
 
     with monkeypatch.context() as patched:
-        patched.setattr(finish, step, refuse)
+        patched.setattr(register_stage, step, refuse)
         assert run_refused(small.photos, small.header, out, "--r-pc", "1.0")["code"] == code
     assert tree_of(out) == before
     assert specimap("run", "--photos", small.photos, "--cube", small.header, "--out", out, "--r-pc", "1.0").status == 0
@@ -115,7 +115,7 @@ def test_a_disk_that_fills_up(small: OnDisk, finished: Finished, tmp_path: Path)
 def test_an_unforeseen_error_is_told_without_a_traceback(
     small: OnDisk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from specimap.core import pipeline
+    from specimap_core import pipeline
 
     def fail(*_: object, **__: object) -> None:
         raise ZeroDivisionError("nobody thought of [this]")

@@ -11,18 +11,20 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from broken_sets import copied, image_of
 from PIL import ExifTags, Image
-from scenes import SMALL, OnDisk, phantom_on_disk, read_corners, run_refused, specimap
-from test_acquisition import bomb
 
-from specimap.core.accuracy import compare_with_truth
-from specimap.core.acquisition import AcquisitionSettings, read_photos
-from specimap.core.cloud import Cloud
-from specimap.core.jsontext import json_text
-from specimap.core.photofolder import photo_folder, photo_paths
-from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline
-from specimap.core.report import Report
+from broken_sets import copied, image_of
+from scenes import SMALL, OnDisk, phantom_on_disk, read_corners, run_refused, specimap
+from specimap_core.cloud import Cloud
+from specimap_core.json_text import json_text
+from specimap_core.photos.folder import photo_folder, photo_paths
+from specimap_core.photos.reading import AcquisitionSettings, read_photos
+from specimap_core.pipeline.outputs import Inputs
+from specimap_core.pipeline.run import run_pipeline
+from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.report.model import Report
+from specimap_core.truth.judge import compare_with_truth
+from test_acquisition import bomb
 
 # ---- photos ---------------------------------------------------------------------------------------------
 
@@ -93,10 +95,10 @@ def test_two_scenes(small: OnDisk, second: str, request: pytest.FixtureRequest, 
 @pytest.fixture
 def shallow(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path, OnDisk], dict[str, str]]:
     """Pose photos without measuring depth; returns the code of each photo that was refused, by name."""
-    from specimap.core.acquisition import AcquisitionSettings, read_photos
-    from specimap.core.photofolder import photo_paths
-    from specimap.core.reconstruct import colmap
-    from specimap.core.reconstruct.backend import ReconstructSettings, corners_in_photos, detect_in_photos
+    from specimap_core.photos.folder import photo_paths
+    from specimap_core.photos.reading import AcquisitionSettings, read_photos
+    from specimap_core.reconstruct.backend import ReconstructSettings, corners_in_photos, detect_in_photos
+    from specimap_core.reconstruct.backends import colmap
 
     monkeypatch.setattr(colmap, "measure_depth", lambda *_, **__: ([], ()))
 
@@ -292,7 +294,7 @@ def test_an_edge_in_another_unit_is_refused(
     small: OnDisk, tmp_path: Path, edge: float, named: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The unit's own range is not what is asked for here.
-    from specimap.core import limits
+    from specimap_core.pipeline import limits
 
     monkeypatch.setitem(limits.RANGES, "edge_mm", (0.01, 1000.0))
     refusal = run_refused(small.photos, small.header, tmp_path / "out", "--edge-mm", edge)

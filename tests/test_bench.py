@@ -9,7 +9,6 @@ from collections.abc import Callable
 from importlib.metadata import version
 
 import pytest
-
 from bench.__main__ import PARTS
 from bench.growth import (
     DISK_SHARE,
@@ -29,7 +28,8 @@ from bench.steps import END, ORDER, REST, START, imports_in, sheet_steps, steps_
 from bench.synthetic import COLS, ROWS
 from bench.tables import OF_RUNS, ROOT, run_tables
 from bench.tracing import TARGETS, Spent, Target, owner_of, tracing
-from specimap.core.evidence.marks import check_marks
+
+from specimap_validation.page_marks import check_marks
 
 
 class _Clock:
@@ -183,7 +183,7 @@ def test_imports_are_summed_by_whose_they_are() -> None:
     said = (
         "import time: self [us] | cumulative | imported package\n"
         "import time:      1000 |       1000 |   numpy.linalg\n"
-        "import time:      2000 |       3000 | specimap.core\n"
+        "import time:      2000 |       3000 | specimap_core\n"
         "a warning | 7 | of something else\n"
         "import time:       500 |        500 | specimapper\n"
     )

@@ -8,22 +8,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import EDGE_MM, marker_scene
 
-from specimap.core.acquisition import AcquisitionSettings, Photo, read_photos, stated_focal_px
-from specimap.core.fiducials import detect_markers
-from specimap.core.geometry import Floats, Intrinsics, fit_similarity
-from specimap.core.phantom import Phantom, PhantomSettings
-from specimap.core.photofolder import photo_paths
-from specimap.core.reconstruct.backend import CornersInPhotos, corners_in_photos, detect_in_photos
-from specimap.core.reconstruct.breathing import (
+from scenes import EDGE_MM, marker_scene
+from specimap_core.bundle_adjust.solver import rms_px
+from specimap_core.fiducials.detection import detect_markers
+from specimap_core.fiducials.observations import Observations
+from specimap_core.geometry.cameras import Floats, Intrinsics, fit_similarity
+from specimap_core.photos.folder import photo_paths
+from specimap_core.photos.reading import AcquisitionSettings, Photo, read_photos, stated_focal_px
+from specimap_core.reconstruct.backend import CornersInPhotos, corners_in_photos, detect_in_photos
+from specimap_core.reconstruct.focal_breathing import (
     bring_to_shared,
     estimate_breathing,
     image_at_shared,
     settle_breathing,
 )
-from specimap.core.reconstruct.markers import solve_from_markers
-from specimap.core.solver import Observations, rms_px
+from specimap_core.reconstruct.poses_from_markers import solve_from_markers
+from specimap_validation.phantom import Phantom, PhantomSettings
 
 SPREAD = 0.01
 BREATHING_SEEDS = (21, 22)

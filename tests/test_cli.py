@@ -11,13 +11,13 @@ import time
 from pathlib import Path
 
 import pytest
+
 from scenes import Finished, OnDisk, assert_same_result, read_corners, specimap
+from specimap_core import __version__
+from specimap_core.pipeline.outputs import Outputs
+from specimap_core.report.model import Report
 
-from specimap import __version__
-from specimap.core.pipeline import Outputs
-from specimap.core.report import Report
-
-PROGRAM = [sys.executable, "-c", "from specimap.cli import main; main()"]
+PROGRAM = [sys.executable, "-c", "from specimap_cli import main; main()"]
 
 
 def started(small: OnDisk, out: Path) -> subprocess.Popen[str]:

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
 from service_scene import serving
 
-PROGRAM = "from specimap.cli.keys import keys_app; keys_app()"
+PROGRAM = "from specimap_cli.keys import keys_app; keys_app()"
 
 
 def keys(folder: Path, *arguments: str, database_url: str = "") -> subprocess.CompletedProcess[str]:

@@ -9,10 +9,11 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-import specimap_client as sc
 import zarr
-from client_scene import Live, connect
 from PIL import Image
+
+import specimap_client as sc
+from client_scene import Live, connect
 from specimap_client import _spectra, _spectra_answers
 from specimap_client._retries import Retries
 

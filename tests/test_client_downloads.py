@@ -8,6 +8,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
+
 import specimap_client as sc
 from client_scene import client_of
 from specimap_client._downloads import chunk_keys, fetch

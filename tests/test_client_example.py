@@ -11,10 +11,11 @@ from statistics import NormalDist
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+
 import specimap_client as sc
 from client_scene import connect
 from cloud_scene import FakeCube, scene
-from numpy.typing import NDArray
 from result_scene import put_result
 from service_scene import Running
 from specimap_client._acquisitions import Acquisitions

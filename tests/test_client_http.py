@@ -8,6 +8,7 @@ from typing import Any
 
 import httpx
 import pytest
+
 import specimap_client as sc
 from client_scene import KEY, answers, client_of, problem
 from specimap_client import Retries

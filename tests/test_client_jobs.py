@@ -9,6 +9,7 @@ from typing import Any
 
 import httpx
 import pytest
+
 import specimap_client as sc
 from client_scene import client_of, problem, sse
 from specimap_client import _events

@@ -9,13 +9,13 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
+
 import specimap_client as sc
 from client_scene import Live, connect
 from job_scene import EXECUTOR, acquisition
 from specimap_client import _tus
 from specimap_client._retries import Retries
-
-from specimap.infra.jobs import claim, finish, log, report_progress
+from specimap_infra.jobs import claim, finish, log, report_progress
 
 SAMPLES = Path(__file__).parents[1] / "samples"
 

@@ -12,6 +12,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+
 import specimap_client as sc
 from specimap_client import _errors
 from test_client_http import JOB

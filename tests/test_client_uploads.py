@@ -10,6 +10,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
+
 import specimap_client as sc
 from client_scene import KEY, TusService, client_of, problem
 from specimap_client import _tus

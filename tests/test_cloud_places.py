@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cloud_scene import FakeCube, counts, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as nps
 
-from specimap.core.cloud import Cloud
-from specimap.core.cloud.outline import in_outline
-from specimap.core.cloud.source import Folder
-from specimap.core.cloud.writer import write_cloud
-from specimap.core.errors import CloudDamagedError, NotFoundError, SpecimapError
+from cloud_scene import FakeCube, counts, scene
+from specimap_core.cloud import Cloud
+from specimap_core.cloud.outline import in_outline
+from specimap_core.cloud.source import Folder
+from specimap_core.cloud.writer import write_cloud
+from specimap_core.errors import CloudDamagedError, NotFoundError, SpecimapError
 
 
 @pytest.fixture(scope="module")

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
-from cloud_scene import FakeCube, counts, scene
 
-from specimap.core.cloud import ARRAYS, CHUNK_POINTS, Cloud, CloudPoints, tile_order
-from specimap.core.cloud import shards as shards_module
-from specimap.core.cloud.writer import write_cloud
-from specimap.core.errors import CloudDamagedError, NotFoundError
-from specimap.core.geometry import Array
+from cloud_scene import FakeCube, counts, scene
+from specimap_core.cloud import ARRAYS, CHUNK_POINTS, Cloud, CloudPoints, tile_order
+from specimap_core.cloud import shards as shards_module
+from specimap_core.cloud.writer import write_cloud
+from specimap_core.errors import CloudDamagedError, NotFoundError
+from specimap_core.geometry.cameras import Array
 
 
 @pytest.fixture(scope="module")
@@ -228,6 +228,6 @@ def test_damage_is_named(tmp_path: Path, cube: FakeCube, points: CloudPoints, da
 
 
 def test_reading_needs_no_heavy_library() -> None:
-    script = "import sys, specimap.core.cloud; print({'tensorstore', 'cv2', 'scipy', 'open3d'} & set(sys.modules))"
+    script = "import sys, specimap_core.cloud; print({'tensorstore', 'cv2', 'scipy', 'open3d'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cloud_scene import FakeCube, counts, scene
 from hypothesis import given
 from hypothesis import strategies as st
 
-from specimap.core.cloud import ARRAYS, Cloud, CloudPoints, Flag, tile_order
-from specimap.core.cloud import writer as writer_module
-from specimap.core.cloud.writer import write_cloud
-from specimap.core.errors import RegistrationError, StorageFullError
+from cloud_scene import FakeCube, counts, scene
+from specimap_core.cloud import ARRAYS, Cloud, CloudPoints, Flag, tile_order
+from specimap_core.cloud import writer as writer_module
+from specimap_core.cloud.writer import write_cloud
+from specimap_core.errors import RegistrationError, StorageFullError
 
 
 @pytest.fixture(scope="module")
@@ -242,8 +242,8 @@ _FILE_TOO_LARGE = """
 import resource, sys
 from pathlib import Path
 from cloud_scene import FakeCube, counts, scene
-from specimap.core.cloud.writer import write_cloud
-from specimap.core.errors import StorageFullError
+from specimap_core.cloud.writer import write_cloud
+from specimap_core.errors import StorageFullError
 resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))
 try:
     write_cloud(Path(sys.argv[1]) / "c.zarr", scene(70, 53), FakeCube(counts()), {})

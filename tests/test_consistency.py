@@ -9,9 +9,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from specimap.core.consistency import HIGHLIGHT, LEAST_WITHOUT_HIGHLIGHTS, Photographs, choose_views, patch_scores
-from specimap.core.geometry import Floats, Intrinsics, Pose
-from specimap.core.surface import Mesh
+from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
+from specimap_core.surface.fusion import Mesh
+from specimap_core.surface.photo_consistency import (
+    HIGHLIGHT,
+    LEAST_WITHOUT_HIGHLIGHTS,
+    Photographs,
+    choose_views,
+    patch_scores,
+)
 
 LENS = Intrinsics.centred(240, 240, 480.0)
 CAMERAS = 10

@@ -13,10 +13,10 @@ from typing import Any
 import httpx
 import pytest
 import yaml
+
 from result_scene import put_result
 from service_scene import Running
-
-from specimap.service.openapi import document
+from specimap_service.openapi import document
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = 12
@@ -36,7 +36,7 @@ def operations(contract: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, A
 
 def test_document_is_what_the_app_serves(contract: dict[str, Any], service: Running) -> None:
     written = yaml.safe_load((ROOT / "openapi.yaml").read_text("utf-8"))
-    assert written == contract, "run: python -m specimap.service.openapi > openapi.yaml"
+    assert written == contract, "run: python -m specimap_service.openapi > openapi.yaml"
     assert httpx.get(f"{service.url}/openapi.json", trust_env=False).json() == contract
     assert contract["openapi"].startswith("3.1.")
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cube_files import FILE_AXES, Values, random_values, write_envi
 
-from specimap.core.cube import open_cube
-from specimap.core.errors import CubeContentError, SettingsError
+from cube_files import FILE_AXES, Values, random_values, write_envi
+from specimap_core.cube import open_cube
+from specimap_core.errors import CubeContentError, SettingsError
 
 
 def references(tmp_path: Path, shape: tuple[int, int, int] = (3, 5, 11)) -> tuple[Values, Values, Path, Path]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_motion import CORNERS, VIEW
 
-from specimap.core.geometry import Intrinsics, View, look_at
-from specimap.core.register.camera import Anchor, CubeCamera, solve_camera
-from specimap.core.register.models import FOCAL_PRIOR_SD, FOCAL_RANGE
+from specimap_core.geometry.cameras import Intrinsics, View, look_at
+from specimap_core.register.camera_models import FOCAL_PRIOR_SD, FOCAL_RANGE
+from specimap_core.register.cube_camera import Anchor, CubeCamera, solve_camera
+from test_motion import CORNERS, VIEW
 
 ROWS, COLS = VIEW.intrinsics.height, VIEW.intrinsics.width
 SHARP_PX = 0.02

@@ -13,12 +13,12 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
-from cube_files import random_values, write_envi
 from scipy import io as scipy_io
 
-from specimap.core.cube import Cube, inspect, open_cube
-from specimap.core.errors import CubeFormatError, SpecimapError
-from specimap.core.intake.cube import judge_cube, judge_part
+from cube_files import random_values, write_envi
+from specimap_core.cube import Cube, inspect, open_cube
+from specimap_core.errors import CubeFormatError, SpecimapError
+from specimap_core.screening.cube import judge_cube, judge_part
 
 SHAPE = (7, 5, 11)
 VALUES = random_values("u1", SHAPE)

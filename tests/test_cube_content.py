@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cube_files import FILE_AXES, Values, random_values, write_envi
 
-from specimap.core.cube import inspect, open_cube
-from specimap.core.errors import CubeContentError
-from specimap.core.intake.cube import judge_cube
+from cube_files import FILE_AXES, Values, random_values, write_envi
+from specimap_core.cube import inspect, open_cube
+from specimap_core.errors import CubeContentError
+from specimap_core.screening.cube import judge_cube
 
 # ---- wavelengths, bad bands, quantity -------------------------------------------------------------------
 

@@ -10,11 +10,11 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
-from cube_files import check_reads, random_values, write_envi
 from scipy import io as scipy_io
 
-from specimap.core.cube import open_cube
-from specimap.core.errors import CubeFormatError, CubeHeaderError, SpecimapError
+from cube_files import check_reads, random_values, write_envi
+from specimap_core.cube import open_cube
+from specimap_core.errors import CubeFormatError, CubeHeaderError, SpecimapError
 
 NM = np.linspace(400, 1000, 11)
 COUNTS = random_values("u2")

@@ -9,12 +9,12 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from cube_files import DTYPES, FILE_AXES, check_reads, random_values, write_envi
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from specimap.core.cube import open_cube
-from specimap.core.errors import CubeFormatError, CubeHeaderError, CubeNotFoundError, CubeTruncatedError
+from cube_files import DTYPES, FILE_AXES, check_reads, random_values, write_envi
+from specimap_core.cube import open_cube
+from specimap_core.errors import CubeFormatError, CubeHeaderError, CubeNotFoundError, CubeTruncatedError
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cube_files import DTYPES, check_reads, random_values, write_envi
 
-from specimap.core.cube import open_cube
-from specimap.core.errors import CubeFormatError, CubeHeaderError, CubeTruncatedError, SpecimapError
+from cube_files import DTYPES, check_reads, random_values, write_envi
+from specimap_core.cube import open_cube
+from specimap_core.errors import CubeFormatError, CubeHeaderError, CubeTruncatedError, SpecimapError
 
 h5py = pytest.importorskip("h5py")
 tifffile = pytest.importorskip("tifffile")
@@ -95,8 +95,8 @@ def test_hdf5_unpacked_where_chunks_do_not_suit_rows(tmp_path: Path, monkeypatch
     with h5py.File(tmp_path / "x.h5", "w") as f:
         f.create_dataset("cube", data=values.transpose(2, 0, 1), chunks=(1, 7, 5), compression="gzip")
         f["wavelength"] = NM
-    monkeypatch.setattr("specimap.core.cube.hdf._LARGEST_CHUNK_ROW", 100)
-    monkeypatch.setattr("specimap.core.cube.scratch.IN_MEMORY_BYTES", 100)
+    monkeypatch.setattr("specimap_core.cube.hdf._LARGEST_CHUNK_ROW", 100)
+    monkeypatch.setattr("specimap_core.cube.unpacked.IN_MEMORY_BYTES", 100)
     check_reads(open_cube(tmp_path / "x.h5"), values)
 
 

@@ -10,9 +10,9 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from cube_files import random_values
 
-from specimap.core.cube import open_cube
+from cube_files import random_values
+from specimap_core.cube import open_cube
 
 NM = np.linspace(400, 1000, 11)
 COUNTS = random_values("u2", (7, 5, 11))
@@ -74,7 +74,7 @@ def test_attributes_of_axes_of_any_type(case: str, tmp_path: Path) -> None:
         f["cube"], f["wavelength"] = COUNTS, NM
         f["cube"].attrs[name] = value
     # In a process of its own: HDF5 may crash it.
-    program = "import sys; from specimap.core.cube import open_cube; print(open_cube(sys.argv[1]).rows)"
+    program = "import sys; from specimap_core.cube import open_cube; print(open_cube(sys.argv[1]).rows)"
     program = program.replace("sys.argv[1]", "__import__('pathlib').Path(sys.argv[1])")
     done = subprocess.run(
         [sys.executable, "-c", program, str(tmp_path / "x.h5")], capture_output=True, text=True, timeout=60

@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from scenes import Finished, OnDisk
+from specimap_core.errors import RegistrationError, SpecimapError
+from specimap_core.geometry.cameras import Intrinsics, View, look_at
+from specimap_core.geometry.pushbroom import Axis, ScanView
+from specimap_core.register.accuracy import on_plane
+from specimap_core.register.camera_fitting import Sight, refit
+from specimap_core.register.camera_models import FRAME
+from specimap_core.register.cube_camera import CubeCamera, solve_camera
+from specimap_core.register.model_selection import Choice, choose_camera
+from specimap_core.register.stripes import without_stripes
+from specimap_core.register.tile_offsets import Sighting
+from specimap_core.report.model import Report
+from specimap_core.truth.judge import Judged, judge_with_sigma
 from test_motion import CORNERS, LARGER
 from test_settle import codes, rerun
-
-from specimap.core.accuracy import on_plane
-from specimap.core.errors import RegistrationError, SpecimapError
-from specimap.core.evidence.truth import Judged, judge_with_sigma
-from specimap.core.geometry import Intrinsics, View, look_at
-from specimap.core.register.camera import CubeCamera, solve_camera
-from specimap.core.register.choose import Choice, choose_camera
-from specimap.core.register.fitting import Sight, refit
-from specimap.core.register.models import FRAME
-from specimap.core.register.sighting import Sighting
-from specimap.core.register.stripes import without_stripes
-from specimap.core.report import Report
-from specimap.core.scan import Axis, ScanView
 
 ROWS, COLS = 256, 320
 SHARP_PX = 0.02

@@ -12,11 +12,11 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
-from cube_files import check_reads, random_values, write_envi
 from scipy import io as scipy_io
 
-from specimap.core.cube import open_cube
-from specimap.core.errors import (
+from cube_files import check_reads, random_values, write_envi
+from specimap_core.cube import open_cube
+from specimap_core.errors import (
     CubeFormatError,
     CubeHeaderError,
     CubeNotFoundError,

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import tifffile
 import xarray
-from cube_files import Values, write_envi
-from value_files import NM, listed
 
-from specimap.core.cube import Cube, inspect, open_cube
-from specimap.core.errors import CubeHeaderError
+from cube_files import Values, write_envi
+from specimap_core.cube import Cube, inspect, open_cube
+from specimap_core.errors import CubeHeaderError
+from value_files import NM, listed
 
 SHAPE = (24, 20, 6)
 

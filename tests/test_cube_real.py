@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cube_files import FILE_AXES, check_reads
 
-from specimap.core.cube import inspect, open_cube
-from specimap.core.errors import CubeHeaderError
+from cube_files import FILE_AXES, check_reads
+from specimap_core.cube import inspect, open_cube
+from specimap_core.errors import CubeHeaderError
 
 tifffile = pytest.importorskip("tifffile")
 

@@ -9,10 +9,10 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 import tifffile
-from cube_files import Values, check_reads, random_values
 
-from specimap.core.cube import open_cube
-from specimap.core.errors import CubeFormatError, SpecimapError
+from cube_files import Values, check_reads, random_values
+from specimap_core.cube import open_cube
+from specimap_core.errors import CubeFormatError, SpecimapError
 
 LOSSLESS = ["lzw", "zlib", "adobe_deflate", "packbits", "lzma", "zstd"]
 

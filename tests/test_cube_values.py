@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 import xarray
 import zarr
+from numpy.typing import NDArray
+
 from cloud_scene import scene
 from cube_files import Values, random_values, write_envi
-from numpy.typing import NDArray
+from specimap_core.cloud import Cloud, Flag
+from specimap_core.cloud.writer import write_cloud
+from specimap_core.cube import Cube, inspect, open_cube
+from specimap_core.errors import CubeContentError, CubeFormatError, CubeHeaderError
+from specimap_core.geometry.cameras import Floats
+from specimap_core.screening.cube import judge_cube
 from value_files import WRITERS, listed
-
-from specimap.core.cloud import Cloud, Flag
-from specimap.core.cloud.writer import write_cloud
-from specimap.core.cube import Cube, inspect, open_cube
-from specimap.core.errors import CubeContentError, CubeFormatError, CubeHeaderError
-from specimap.core.geometry import Floats
-from specimap.core.intake.cube import judge_cube
 
 FORMATS = sorted(WRITERS)
 

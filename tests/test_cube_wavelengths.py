@@ -11,15 +11,15 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
-from cube_files import random_values, write_envi
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import io as scipy_io
 
-from specimap.core.cube import Cube, open_cube
-from specimap.core.cube.spectral_units import read_unit
-from specimap.core.cube.wavelengths import nanometres
-from specimap.core.errors import CubeHeaderError
+from cube_files import random_values, write_envi
+from specimap_core.cube import Cube, open_cube
+from specimap_core.cube.spectral_units import read_unit
+from specimap_core.cube.wavelengths import nanometres
+from specimap_core.errors import CubeHeaderError
 
 NM = np.linspace(461.905, 1700, 16)
 BANDS = np.arange(1.0, 17)

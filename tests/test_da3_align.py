@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scenes import SMALL, OnDisk
 from scipy.ndimage import gaussian_filter
-from true_depth import true_depth
 
-from specimap.core.geometry import Intrinsics, Pose, View, look_at
-from specimap.core.phantom import Phantom
-from specimap.core.reconstruct.agreement import confirmed, nearest_photos
-from specimap.core.reconstruct.da3.backend import Metric, in_millimetres, maps_of, smooth_surface
-from specimap.core.reconstruct.da3.bend import bend
-from specimap.core.reconstruct.da3.prepare import conditioning, plan_preparation, windows
-from specimap.core.reconstruct.learned.alignment import align, depths_at, on_markers
-from specimap.core.reconstruct.volume import Singles, volume_over
-from specimap.core.solver import Observations
+from scenes import SMALL, OnDisk
+from specimap_core.fiducials.observations import Observations
+from specimap_core.geometry.cameras import Intrinsics, Pose, View, look_at
+from specimap_core.reconstruct.backends.da3.backend import Metric, in_millimetres, maps_of, smooth_surface
+from specimap_core.reconstruct.backends.da3.prepare import conditioning, plan_preparation, windows
+from specimap_core.reconstruct.backends.da3.residual_field import bend
+from specimap_core.reconstruct.backends.depth_alignment import align, depths_at, on_markers
+from specimap_core.reconstruct.dense.cross_check import confirmed, nearest_photos
+from specimap_core.reconstruct.dense.volume import Singles, volume_over
+from specimap_validation.phantom import Phantom
+from true_depth import true_depth
 
 
 class Exact:

@@ -11,11 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from da3_oracle import FACTS, oracle, random_weights, write_script
 from scenes import SMALL, OnDisk
-
-from specimap.core.acquisition import AcquisitionSettings, Photo, read_photos
-from specimap.core.errors import (
+from specimap_core.errors import (
     BackendFailedError,
     BackendUnavailableError,
     CancelledError,
@@ -23,11 +22,14 @@ from specimap.core.errors import (
     SettingsError,
     SpecimapError,
 )
-from specimap.core.evidence.truth import judge
-from specimap.core.geometry import look_at
-from specimap.core.photofolder import photo_paths
-from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline, stages
-from specimap.core.reconstruct.backend import (
+from specimap_core.geometry.cameras import look_at
+from specimap_core.photos.folder import photo_paths
+from specimap_core.photos.reading import AcquisitionSettings, Photo, read_photos
+from specimap_core.pipeline import stages
+from specimap_core.pipeline.outputs import Inputs
+from specimap_core.pipeline.run import run_pipeline
+from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.reconstruct.backend import (
     CornersInPhotos,
     Progress,
     Reconstruction,
@@ -35,12 +37,13 @@ from specimap.core.reconstruct.backend import (
     corners_in_photos,
     detect_in_photos,
 )
-from specimap.core.reconstruct.da3.backend import CHILD, Da3Backend
-from specimap.core.reconstruct.da3.child import VARIANTS, variant_of
-from specimap.core.reconstruct.da3.prepare import conditioning
-from specimap.core.reconstruct.da3.settings import Da3Settings, settings_from_environment
-from specimap.core.reconstruct.learned.process import run_child
-from specimap.core.reconstruct.learned.weights import sha256_of
+from specimap_core.reconstruct.backends.da3.backend import CHILD, Da3Backend
+from specimap_core.reconstruct.backends.da3.child import VARIANTS, variant_of
+from specimap_core.reconstruct.backends.da3.prepare import conditioning
+from specimap_core.reconstruct.backends.da3.settings import Da3Settings, settings_from_environment
+from specimap_core.reconstruct.backends.weights import sha256_of
+from specimap_core.sandbox.process import run_child
+from specimap_core.truth.judge import judge
 
 HOME = "SPECIMAP_DA3_HOME"
 SIZE_PX = 378
@@ -110,7 +113,7 @@ def test_true_depth_in_any_unit_makes_a_true_cloud(
     monkeypatch.setattr(stages, "backend_named", lambda name: {"da3": Da3Backend(own, script)}[name])
     # The run's key names the weights; what a real network would import is not needed.
     monkeypatch.setenv("SPECIMAP_DA3_WEIGHTS", str(weights))
-    monkeypatch.setattr("specimap.core.reconstruct.learned.required.check_backend", lambda name: None)
+    monkeypatch.setattr("specimap_core.reconstruct.backends.requirements.check_backend", lambda name: None)
     settings = PipelineSettings()
     settings = replace(settings, reconstruct=replace(settings.reconstruct, backend="da3"))
     heard: list[tuple[str, float]] = []

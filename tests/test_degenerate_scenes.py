@@ -12,28 +12,28 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from scenes import SMALL, Finished, OnDisk, bump_mesh, cube_with, marker_scene, phantom_on_disk, specimap
 
-from specimap.core.adjust import AdjustSettings, Form, adjust
-from specimap.core.cloud import Cloud
-from specimap.core.cloud.writer import write_cloud
-from specimap.core.cube import open_cube
-from specimap.core.errors import MemoryExhaustedError, SpecimapError, StageFailedError
-from specimap.core.export import export_cloud
-from specimap.core.geometry import Floats, Intrinsics, Pose, View, look_at
-from specimap.core.pipeline.clock import Clock
-from specimap.core.points import cloud_points
-from specimap.core.preview import write_preview
-from specimap.core.raycast import RayCaster
-from specimap.core.reconstruct.dense import dense_depth
-from specimap.core.reconstruct.depth import DepthMap, DepthSettings
-from specimap.core.reconstruct.markers import solve_from_markers
-from specimap.core.reconstruct.volume import volume_over
-from specimap.core.refine import RefineSettings, refine_mesh
-from specimap.core.register.register import fit_homography, place_by_camera, place_by_homography
-from specimap.core.render import extent_of, render_grid
-from specimap.core.surface import Mesh, SurfaceSettings, fuse, vertex_normals
-from specimap.core.uncertainty import mesh_sigma
+from scenes import SMALL, Finished, OnDisk, bump_mesh, cube_with, marker_scene, phantom_on_disk, specimap
+from specimap_core.bundle_adjust.adjust import AdjustSettings, Form, adjust
+from specimap_core.cloud import Cloud
+from specimap_core.cloud.preview import write_preview
+from specimap_core.cloud.writer import write_cloud
+from specimap_core.cube import open_cube
+from specimap_core.errors import MemoryExhaustedError, SpecimapError, StageFailedError
+from specimap_core.export import export_cloud
+from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, View, look_at
+from specimap_core.pipeline.clock import Clock
+from specimap_core.reconstruct.dense.depth_map import DepthMap, DepthSettings
+from specimap_core.reconstruct.dense.multi_view import dense_depth
+from specimap_core.reconstruct.dense.volume import volume_over
+from specimap_core.reconstruct.poses_from_markers import solve_from_markers
+from specimap_core.register.placement import fit_homography, place_by_camera, place_by_homography
+from specimap_core.register.points import cloud_points
+from specimap_core.render.orthographic import extent_of, render_grid
+from specimap_core.surface.fusion import Mesh, SurfaceSettings, fuse, vertex_normals
+from specimap_core.surface.raycast import RayCaster
+from specimap_core.surface.refinement import RefineSettings, refine_mesh
+from specimap_core.surface.uncertainty import mesh_sigma
 
 SWEEP = settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 SLOW_SWEEP = settings(SWEEP, max_examples=25)

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from matched_scene import Matched, matched
-from true_depth import true_depth
 
-from specimap.core.errors import CancelledError
-from specimap.core.geometry import Floats, Intrinsics
-from specimap.core.reconstruct.dense import dense_depth
-from specimap.core.reconstruct.depth import DepthMap, DepthSettings
-from specimap.core.refine import pixel_footprint_mm
+from matched_scene import Matched, matched
+from specimap_core.errors import CancelledError
+from specimap_core.geometry.cameras import Floats, Intrinsics
+from specimap_core.reconstruct.dense.depth_map import DepthMap, DepthSettings
+from specimap_core.reconstruct.dense.multi_view import dense_depth
+from specimap_core.surface.refinement import pixel_footprint_mm
+from true_depth import true_depth
 
 SEEDS = (31, 32)
 GROSS_MM = 1.5

@@ -12,16 +12,16 @@ from pathlib import Path
 import pytest
 import sqlalchemy as sa
 import typer
+from typer.core import TyperGroup
+
 from result_scene import Result, put_result
 from service_scene import Running
-from typer.core import TyperGroup
+from specimap_cli.app import app
+from specimap_infra import jobs
+from specimap_infra.ids import new_id
+from specimap_infra.tables import CloudRow, Job
 from upload_scene import SAMPLES, photos
 from worker_scene import until
-
-from specimap.cli.app import app
-from specimap.infra import jobs
-from specimap.infra.ids import new_id
-from specimap.infra.models import CloudRow, Job
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "Makefile"]

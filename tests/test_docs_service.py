@@ -17,15 +17,15 @@ import httpx
 import numpy as np
 import pyarrow as pa
 import pytest
+
 from docs_scene import PAGE, Reader, documents, header
 from export_scene import make
 from result_scene import put_result
 from service_scene import serving
+from specimap_core.cloud import Cloud
+from specimap_infra import jobs
+from specimap_infra.webhooks import deliver_due, sign, webhook_client
 from upload_scene import SAMPLES, photos, sent
-
-from specimap.core.cloud import Cloud
-from specimap.infra import jobs
-from specimap.infra.webhooks import deliver_due, sign, webhook_client
 
 EXECUTOR = "host:0:page"
 SECRET = "0123456789abcdef"

@@ -13,11 +13,11 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from specimap.cli.doctor import doctor
-from specimap.core.reconstruct.learned import availability
-from specimap.core.reconstruct.learned.availability import Diagnosis, Machine, Missing, Usable
-from specimap.core.reconstruct.learned.probing import driver_gpus, probe
-from specimap.core.reconstruct.mast3r.settings import NEEDED
+from specimap_cli.doctor import doctor
+from specimap_core.reconstruct.backends import doctor as availability
+from specimap_core.reconstruct.backends.doctor import Diagnosis, Machine, Missing, Usable
+from specimap_core.reconstruct.backends.mast3r.settings import NEEDED
+from specimap_core.reconstruct.backends.probe import driver_gpus, probe
 
 app = typer.Typer()
 app.command()(doctor)

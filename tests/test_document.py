@@ -11,15 +11,15 @@ from xml.etree import ElementTree
 import cv2
 import numpy as np
 import pytest
+
 from cloud_scene import scene
 from document_scene import Page, folder_of, full_report
-
-from specimap.core.cloud import Cloud, CloudPoints
-from specimap.core.document import write_document
-from specimap.core.document.maps import cube_frame, from_above, spacing_mm
-from specimap.core.errors import CloudDamagedError, NotFoundError
-from specimap.core.export import export_cloud
-from specimap.core.report import Refused, Remark, Report
+from specimap_core.cloud import Cloud, CloudPoints
+from specimap_core.errors import CloudDamagedError, NotFoundError
+from specimap_core.export import export_cloud
+from specimap_core.report.document import write_document
+from specimap_core.report.maps import cube_frame, from_above, spacing_mm
+from specimap_core.report.model import Refused, Remark, Report
 
 HOSTILE = """<script>alert(1)</script>&"'$x^2_{$\u202e\x07ü.jpg"""
 

@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scenes import EDGE_MM, marker_scene
 
-from specimap.core.acquisition import Refusal
-from specimap.core.adjust import Adjusted, AdjustSettings, adjust
-from specimap.core.geometry import Intrinsics, View
-from specimap.core.pipeline.artefacts import Stage1
-from specimap.core.pipeline.corners import cube_corners, photo_corners
-from specimap.core.reconstruct.backend import CornersInPhotos, Reconstruction
-from specimap.core.register.cube_markers import CubeMarkers
+from scenes import EDGE_MM, marker_scene
+from specimap_core.bundle_adjust.adjust import Adjusted, AdjustSettings, adjust
+from specimap_core.geometry.cameras import Intrinsics, View
+from specimap_core.photos.reading import Refusal
+from specimap_core.pipeline.artefacts import Stage1
+from specimap_core.pipeline.corners import cube_corners, photo_corners
+from specimap_core.reconstruct.backend import CornersInPhotos, Reconstruction
+from specimap_core.register.cube_markers import CubeMarkers
 
 NOISE_PX = 0.2
 IDS = (3, 5, 8, 9)

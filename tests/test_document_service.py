@@ -10,16 +10,16 @@ from pathlib import Path
 
 import httpx
 import pytest
+
 from document_scene import Page, folder_of, full_report
 from export_scene import address, make
 from result_scene import Result, put_result
 from service_scene import Running
-
-from specimap.core.document import write_document
-from specimap.core.export.formats import KINDS, FileFormat
-from specimap.workers import exports
-from specimap.workers.cells import Cell, Cells
-from specimap.workers.job import JobRun
+from specimap_core.export.formats import KINDS, FileFormat
+from specimap_core.report.document import write_document
+from specimap_workers import exports
+from specimap_workers.job import JobRun
+from specimap_workers.workspaces import Cell, Cells
 
 
 @pytest.fixture
@@ -99,7 +99,7 @@ def test_a_stored_report_that_is_damaged(service: Running, client: httpx.Client,
 
 
 def test_the_api_draws_nothing() -> None:
-    code = "import sys, specimap.service.app\nprint([m for m in ('matplotlib', 'reportlab') if m in sys.modules])"
+    code = "import sys, specimap_service.app\nprint([m for m in ('matplotlib', 'reportlab') if m in sys.modules])"
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
     assert told.stdout.strip() == "[]"
 

@@ -6,10 +6,10 @@ import re
 from pathlib import Path
 
 import pytest
-from document_scene import full_report
 
-from specimap.core.document.words import REFUSALS, REMARKS, checks, placed, verdict
-from specimap.core.report import Refused, Remark, SigmaFigures
+from document_scene import full_report
+from specimap_core.report.model import Refused, Remark, SigmaFigures
+from specimap_core.report.wording import REFUSALS, REMARKS, checks, placed, verdict
 
 DOCS = Path(__file__).parents[1] / "docs"
 

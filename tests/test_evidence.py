@@ -7,17 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import Finished, OnDisk
 
-from specimap.core.cloud import Cloud
-from specimap.core.errors import CubeNotFoundError, NotFoundError, SettingsError, TooFewPhotosError
-from specimap.core.evidence import published
-from specimap.core.evidence.capture import find_capture
-from specimap.core.evidence.marks import check_marks, put
-from specimap.core.evidence.runs import STAGE_SHARES, figures_of
-from specimap.core.evidence.tables import Table
-from specimap.core.evidence.truth import evenly, judge, judge_with_sigma, some
-from specimap.core.progress import within
+from scenes import Finished, OnDisk
+from specimap_core.cloud import Cloud
+from specimap_core.errors import CubeNotFoundError, NotFoundError, SettingsError, TooFewPhotosError
+from specimap_core.progress import within
+from specimap_core.report import published
+from specimap_core.truth.judge import judge, judge_with_sigma
+from specimap_validation.capture import find_capture
+from specimap_validation.page_marks import check_marks, put
+from specimap_validation.photo_subsets import evenly, some
+from specimap_validation.runs import STAGE_SHARES, figures_of
+from specimap_validation.tables import Table
 
 # ---- acquisitions -------------------------------------------------------------------------------------
 

@@ -12,14 +12,14 @@ import laspy
 import numpy as np
 import pytest
 import spectral.io.envi
-from cloud_scene import FakeCube, counts, scene
 from numpy.typing import NDArray
 
-from specimap.core.cloud import Cloud, CloudPoints
-from specimap.core.cloud.writer import write_cloud
-from specimap.core.errors import SettingsError, StorageFullError
-from specimap.core.export import EXPORTERS, ExportFormat, envi, export_cloud
-from specimap.core.topview import top_view
+from cloud_scene import FakeCube, counts, scene
+from specimap_core.cloud import Cloud, CloudPoints
+from specimap_core.cloud.top_view import top_view
+from specimap_core.cloud.writer import write_cloud
+from specimap_core.errors import SettingsError, StorageFullError
+from specimap_core.export import EXPORTERS, ExportFormat, envi, export_cloud
 
 HOLDING = [format for format in EXPORTERS if format not in ("html", "pdf")]
 """Formats that hold the cloud; the others are the report on it, which tests/test_document.py is about."""

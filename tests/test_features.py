@@ -6,13 +6,15 @@ import threading
 
 import numpy as np
 import pytest
-from scenes import OnDisk, rotation_deg
 
-from specimap.core.acquisition import AcquisitionSettings, Photo, read_photos
-from specimap.core.geometry import Intrinsics, View, look_at
-from specimap.core.photofolder import photo_paths
-from specimap.core.reconstruct.features import Sift, colmap_camera, extract, match, triangulate_pair
-from specimap.core.reconstruct.locating import Locator
+from scenes import OnDisk, rotation_deg
+from specimap_core.geometry.cameras import Intrinsics, View, look_at
+from specimap_core.geometry.colmap_cameras import colmap_camera
+from specimap_core.geometry.triangulation import triangulate_pair
+from specimap_core.photos.folder import photo_paths
+from specimap_core.photos.reading import AcquisitionSettings, Photo, read_photos
+from specimap_core.reconstruct.features.sift import Sift, extract, match
+from specimap_core.reconstruct.resection import Locator
 
 TARGET = np.array([0.0, 0.0, 3.0])
 

@@ -9,23 +9,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from specimap.core import edges
-from specimap.core.acquisition import AcquisitionSettings, Photo, read_photo
-from specimap.core.colour import linear_from_srgb, srgb_from_linear
-from specimap.core.edges import refine_corners
-from specimap.core.errors import (
+from specimap_core.errors import (
     DuplicateMarkersError,
     NoMarkersFoundError,
     UnknownDictionaryError,
     WrongDictionaryError,
 )
-from specimap.core.fiducials import (
-    detect_markers,
-    dictionary_named,
-    fitting_dictionaries,
-)
-from specimap.core.geometry import Floats
-from specimap.core.reconstruct.backend import corners_in_photos
+from specimap_core.fiducials import subpixel
+from specimap_core.fiducials.detection import detect_markers, dictionary_named, fitting_dictionaries
+from specimap_core.fiducials.subpixel import refine_corners
+from specimap_core.geometry.cameras import Floats
+from specimap_core.photos.colour import linear_from_srgb, srgb_from_linear
+from specimap_core.photos.reading import AcquisitionSettings, Photo, read_photo
+from specimap_core.reconstruct.backend import corners_in_photos
 
 Bytes = NDArray[np.uint8]
 
@@ -143,7 +139,7 @@ def covered(low: float, high: float, count: int) -> NDArray[np.float32]:
 def test_sharp_edges_along_the_pixels_are_found_between_them(monkeypatch: pytest.MonkeyPatch) -> None:
     """All profiles of such an edge are sampled alike, so that nothing averages out: blurring them first does."""
     softened = between_pixels()
-    monkeypatch.setattr(edges, "EDGE_PX", 0.0)
+    monkeypatch.setattr(subpixel, "EDGE_PX", 0.0)
     assert 0.0005 < softened < between_pixels() / 2
 
 

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cloud_scene import scene
 
-from specimap.core.cloud import Cloud, Flag
-from specimap.core.cloud.writer import write_cloud
-from specimap.core.cube import inspect, open_cube
-from specimap.core.geometry import Array
+from cloud_scene import scene
+from specimap_core.cloud import Cloud, Flag
+from specimap_core.cloud.writer import write_cloud
+from specimap_core.cube import inspect, open_cube
+from specimap_core.geometry.cameras import Array
 
 
 def read(data_dir: Path, folder: Path, name: str) -> tuple[Array, Array, Cloud, set[str]]:

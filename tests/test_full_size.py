@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-
 from bench.enlarge import enlarge
 from bench.sample import SAMPLE
-from specimap.core.evidence.truth import Judged, judge_with_sigma
-from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline
+
+from specimap_core.pipeline.outputs import Inputs
+from specimap_core.pipeline.run import run_pipeline
+from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.truth.judge import Judged, judge_with_sigma
 
 SIZES = {"3000 x 3000": (3000, 3000), "4000 x 3000": (4000, 3000)}
 PHOTOS = 2

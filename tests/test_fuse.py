@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from specimap.core.errors import DepthNotFoundError
-from specimap.core.geometry import Intrinsics, Pose
-from specimap.core.reconstruct.depth import DepthMap
-from specimap.core.reconstruct.volume import Volume, inside_volume
-from specimap.core.surface import SurfaceSettings, fuse
+from specimap_core.errors import DepthNotFoundError
+from specimap_core.geometry.cameras import Intrinsics, Pose
+from specimap_core.reconstruct.dense.depth_map import DepthMap
+from specimap_core.reconstruct.dense.volume import Volume, inside_volume
+from specimap_core.surface.fusion import SurfaceSettings, fuse
 
 LENS = Intrinsics.centred(40, 30, 50.0)
 EMPTY = DepthMap(

@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from broken_sets import card_moved, copied, sheared
 from document_scene import full_report, square
 from scenes import EDGE_MM, SMALL, Finished, OnDisk, marker_scene, phantom_on_disk, run_refused, specimap
-
-from specimap.core.document.words import GRAVE, REMARKS, checks, verdict
-from specimap.core.errors import RegistrationError, ResultInsufficientError
-from specimap.core.gates import gated, outlying_photos
-from specimap.core.geometry import look_at
-from specimap.core.reconstruct.backend import CornersInPhotos
-from specimap.core.reconstruct.strays import strays
-from specimap.core.report import PhotoCorners, Report
+from specimap_core.errors import RegistrationError, ResultInsufficientError
+from specimap_core.geometry.cameras import look_at
+from specimap_core.reconstruct.backend import CornersInPhotos
+from specimap_core.reconstruct.pose_check import strays
+from specimap_core.report.model import PhotoCorners, Report
+from specimap_core.report.quality_gates import gated, outlying_photos
+from specimap_core.report.wording import GRAVE, REMARKS, checks, verdict
 
 # ---- figures ------------------------------------------------------------------------------------------
 

@@ -7,19 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import rotation_deg
 
-from specimap.core.geometry import (
-    Intrinsics,
-    Pose,
-    View,
-    colmap_from_opencv,
-    fit_similarity,
-    look_at,
-    opencv_from_colmap,
-    rotation_from_vector,
-    skew,
-)
+from scenes import rotation_deg
+from specimap_core.geometry.cameras import Intrinsics, Pose, View, fit_similarity, look_at, rotation_from_vector, skew
+from specimap_core.geometry.colmap_cameras import colmap_from_opencv, opencv_from_colmap
 
 LENS = Intrinsics(640, 480, 700.0, 322.5, 236.25, 0.08, -0.03)
 

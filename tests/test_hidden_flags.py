@@ -10,17 +10,19 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scenes import xyz_image
 
-from specimap.core.cloud import Cloud, Flag
-from specimap.core.geometry import Floats, fit_similarity
-from specimap.core.phantom import Phantom, PhantomSettings, write_cube, write_phantom
-from specimap.core.phantom.specimen import TRAY_Z_MM
-from specimap.core.phantom.truth import Truth
-from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline
-from specimap.core.raycast import RayCaster
-from specimap.core.register.register import Method, RegisterSettings
-from specimap.core.surface import Mesh
+from scenes import xyz_image
+from specimap_core.cloud import Cloud, Flag
+from specimap_core.geometry.cameras import Floats, fit_similarity
+from specimap_core.pipeline.outputs import Inputs
+from specimap_core.pipeline.run import run_pipeline
+from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.register.placement import Method, RegisterSettings
+from specimap_core.surface.fusion import Mesh
+from specimap_core.surface.raycast import RayCaster
+from specimap_core.truth.truth_file import Truth
+from specimap_validation.phantom import Phantom, PhantomSettings, write_cube, write_phantom
+from specimap_validation.phantom.specimen import TRAY_Z_MM
 
 Mask = NDArray[np.bool_]
 SEEDS = (3, 22)

@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 import sqlalchemy as sa
 
-from specimap.core.pipeline.artefacts import Store
-from specimap.infra import jobs
-from specimap.infra.database import Database
-from specimap.infra.ids import new_id
-from specimap.infra.models import Acquisition, Artefact, Job
-from specimap.infra.settings import load_settings
-from specimap.infra.storage import Storage
-from specimap.workers.artefacts import Artefacts
+from specimap_core.pipeline.artefacts import Store
+from specimap_infra import jobs
+from specimap_infra.database import Database
+from specimap_infra.ids import new_id
+from specimap_infra.settings import load_settings
+from specimap_infra.storage import Storage
+from specimap_infra.tables import Acquisition, Artefact, Job
+from specimap_workers.artefacts import Artefacts
 
 JOBS = 6
 

@@ -9,22 +9,22 @@ from typing import Any
 
 import numpy as np
 import pytest
-from document_scene import folder_of, full_report
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes import specimap
 
-from specimap.cli.progress import json_listener
-from specimap.core.jsontext import json_log_line, json_ready, json_text
-from specimap.core.pipeline.outputs import Outputs
-from specimap.core.report import Report, Spread, read_report
+from document_scene import folder_of, full_report
+from scenes import specimap
+from specimap_cli.progress import json_listener
+from specimap_core.json_text import json_log_line, json_ready, json_text
+from specimap_core.pipeline.outputs import Outputs
+from specimap_core.report.model import Report, Spread, read_report
 
 ROOT = Path(__file__).parents[1]
 ELSEWHERE = {
     # These run in an interpreter of the network's own, without Specimap; who reads them writes strictly.
-    "specimap/core/reconstruct/learned/child.py",
-    "specimap/core/reconstruct/learned/probing.py",
-    "specimap/core/jsontext.py",
+    "core/specimap_core/sandbox/child.py",
+    "core/specimap_core/reconstruct/backends/probe.py",
+    "core/specimap_core/json_text.py",
 }
 
 

@@ -12,25 +12,28 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
+
 from backend_files import bring_da3, bring_mast3r, no_variables
 from scenes import OnDisk
+from specimap_core.bundle_adjust.adjust import AdjustSettings
+from specimap_core.errors import BackendUnavailableError, SettingsError
+from specimap_core.pipeline.artefacts import key_of
+from specimap_core.pipeline.keys import surface_keys
+from specimap_core.pipeline.settings import PipelineSettings, settings_from
+from specimap_core.reconstruct.backend import ReconstructSettings
+from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES
+from specimap_core.reconstruct.backends.mast3r import settings as mast3r
+from specimap_core.reconstruct.backends.requirements import check_required
+from specimap_core.reconstruct.dense import patchmatch
+from specimap_core.reconstruct.dense.depth_map import DepthSettings, Device
+from specimap_core.reconstruct.dense.device import DEVICES, dense_device
+from specimap_core.reconstruct.features import sift
+from specimap_core.sandbox.environment import bare_environment
+from specimap_core.sandbox.process import child_environment
+from specimap_workers.plan import plan_of
+from specimap_workers.stage_process import StageProcess
+from specimap_workers.workspaces import Cells
 from worker_scene import shop
-
-from specimap.core.adjust import AdjustSettings
-from specimap.core.errors import BackendUnavailableError, SettingsError
-from specimap.core.pipeline.artefacts import key_of
-from specimap.core.pipeline.keys import surface_keys
-from specimap.core.pipeline.settings import PipelineSettings, settings_from
-from specimap.core.reconstruct import features, patchmatch
-from specimap.core.reconstruct.backend import ReconstructSettings
-from specimap.core.reconstruct.depth import DepthSettings, Device
-from specimap.core.reconstruct.learned.environment import BACKEND_VARIABLES, DEVICES, bare_environment, dense_device
-from specimap.core.reconstruct.learned.process import child_environment
-from specimap.core.reconstruct.learned.required import check_required
-from specimap.core.reconstruct.mast3r import settings as mast3r
-from specimap.workers.cells import Cells
-from specimap.workers.plan import plan_of
-from specimap.workers.processes import StageProcess
 
 Bring = Callable[[Path, pytest.MonkeyPatch], Path]
 BACKENDS = [("mast3r", bring_mast3r), ("da3", bring_da3)]
@@ -227,12 +230,12 @@ def refused(**given: object) -> BackendUnavailableError:
 
 
 def test_the_default_needs_nothing_more(bare: pytest.MonkeyPatch) -> None:
-    bare.setattr("specimap.core.reconstruct.learned.required.probe", None)  # no interpreter is asked
+    bare.setattr("specimap_core.reconstruct.backends.requirements.probe", None)  # no interpreter is asked
     check_required(ReconstructSettings())
 
 
 def test_features_that_are_not_installed_are_refused_where_the_backend_takes_them(bare: pytest.MonkeyPatch) -> None:
-    bare.setattr(features, "aliked_missing", lambda: ["kornia"])
+    bare.setattr(sift, "aliked_missing", lambda: ["kornia"])
     for backend in ("colmap", "da3"):
         assert "ALIKED needs kornia" in refused(backend=backend, features="aliked").message
     assert "checkout" in refused(backend="mast3r", features="aliked").message

@@ -13,15 +13,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from specimap.core.errors import (
+from specimap_core.errors import (
     BackendFailedError,
     BackendUnavailableError,
     CancelledError,
     PhotosNotConnectedError,
     SpecimapError,
 )
-from specimap.core.geometry import Array
-from specimap.core.reconstruct.learned.process import Answer, child_environment, leaf_of, run_child
+from specimap_core.geometry.cameras import Array
+from specimap_core.sandbox.process import Answer, child_environment, leaf_of, run_child
 
 STEPS = {"first": 1.0, "second": 3.0}
 SOON = 5.0
@@ -126,7 +126,7 @@ def test_child_reaches_no_network(tmp_path: Path, attempt: str) -> None:
 def test_child_knows_specimap_only_by_its_own_files(tmp_path: Path) -> None:
     # Under an interpreter without anything installed but NumPy, errors must still arrive typed.
     body = (
-        "from specimap.core.errors import PhotosNotConnectedError\n"
+        "from specimap_core.errors import PhotosNotConnectedError\n"
         "heavy = sorted({'cv2', 'scipy', 'pycolmap', 'open3d'} & set(sys.modules))\n"
         "raise PhotosNotConnectedError('Apart.', advice='Do.', photos=['a'], heavy=heavy)"
     )

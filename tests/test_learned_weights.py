@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from specimap.core.errors import BackendUnavailableError
-from specimap.core.reconstruct.learned import weights
-from specimap.core.reconstruct.learned.weights import Weights, find_weights, named_path, sha256_of
+from specimap_core.errors import BackendUnavailableError
+from specimap_core.reconstruct.backends import weights
+from specimap_core.reconstruct.backends.weights import Weights, find_weights, named_path, sha256_of
 
 
 def find(path: Path | None, pin: str | None = None) -> Weights:

@@ -11,8 +11,8 @@ from typing import Literal
 import pytest
 import structlog
 
-from specimap.infra.logs import logger, set_up_logs
-from specimap.infra.settings import load_settings
+from specimap_infra.logs import logger, set_up_logs
+from specimap_infra.settings import load_settings
 
 
 @pytest.fixture(autouse=True)

@@ -6,16 +6,18 @@ from functools import cache
 
 import numpy as np
 import pytest
-from true_depth import true_depth
 
-from specimap.core.errors import DepthNotFoundError
-from specimap.core.geometry import Floats, Intrinsics, Pose, View, look_at
-from specimap.core.phantom import Phantom, PhantomSettings
-from specimap.core.reconstruct import dense
-from specimap.core.reconstruct.dense import dense_depth
-from specimap.core.reconstruct.depth import Bytes, DepthSettings, choose_pairs, sight_angles
-from specimap.core.reconstruct.volume import Volume, lattice_over, volume_over
-from specimap.core.surface import SurfaceSettings
+from specimap_core.errors import DepthNotFoundError
+from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, View, look_at
+from specimap_core.reconstruct.dense import multi_view
+from specimap_core.reconstruct.dense.depth_map import Bytes, DepthSettings
+from specimap_core.reconstruct.dense.multi_view import dense_depth
+from specimap_core.reconstruct.dense.pairs import choose_pairs
+from specimap_core.reconstruct.dense.stereo import sight_angles
+from specimap_core.reconstruct.dense.volume import Volume, lattice_over, volume_over
+from specimap_core.surface.fusion import SurfaceSettings
+from specimap_validation.phantom import Phantom, PhantomSettings
+from true_depth import true_depth
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -135,7 +137,7 @@ def test_few_photos_all_around_are_said_to_lie_too_far_apart() -> None:
 
 def test_two_maps_alone_are_no_surface() -> None:
     """Fusion wants three; what two show is refused where the reason is known."""
-    assert SurfaceSettings().least_weight <= dense.LEAST_MAPS
+    assert SurfaceSettings().least_weight <= multi_view.LEAST_MAPS
 
 
 def test_photos_of_single_markers_are_said_to_show_nothing_in_common() -> None:

@@ -6,15 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import EDGE_MM, marker_scene, rotation_deg
 
-from specimap.core.errors import MarkerGeometryError
-from specimap.core.geometry import Floats, Intrinsics, Pose, fit_similarity
-from specimap.core.reconstruct.backend import CornersInPhotos
-from specimap.core.reconstruct.markers import MarkerSolution, solve_from_markers
-from specimap.core.reconstruct.misread import misread, start_without, without
-from specimap.core.reconstruct.squares import two_poses
-from specimap.core.solver import MarkerScene, Observations, corners_of, rms_px, solve, square_corners
+from scenes import EDGE_MM, marker_scene, rotation_deg
+from specimap_core.bundle_adjust.solver import MarkerScene, rms_px, solve
+from specimap_core.errors import MarkerGeometryError
+from specimap_core.fiducials.observations import Observations, corners_of, square_corners
+from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, fit_similarity
+from specimap_core.reconstruct.backend import CornersInPhotos
+from specimap_core.reconstruct.false_markers import misread, start_without, without
+from specimap_core.reconstruct.poses_from_markers import MarkerSolution, solve_from_markers
+from specimap_core.reconstruct.square_poses import two_poses
 
 SIZE = (640, 480)
 

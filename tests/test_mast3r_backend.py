@@ -9,21 +9,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from mast3r_scene import CLOSE_MM, Seen, answer_of, reconstruct, scripted_settings, see, true_points
 from scenes import SMALL, OnDisk
-
-from specimap.core.errors import (
+from specimap_core.errors import (
     BackendUnavailableError,
     DepthNotFoundError,
     MarkerGeometryError,
     PhotosNotConnectedError,
 )
-from specimap.core.geometry import Floats, Pose, fit_similarity, rotation_from_vector
-from specimap.core.reconstruct.backend import Reconstruction
-from specimap.core.reconstruct.mast3r.backend import LICENCE
-from specimap.core.reconstruct.mast3r.maps import bytes_of
-from specimap.core.reconstruct.mast3r.settings import Mast3rSettings
-from specimap.core.solver import Observations
+from specimap_core.fiducials.observations import Observations
+from specimap_core.geometry.cameras import Floats, Pose, fit_similarity, rotation_from_vector
+from specimap_core.reconstruct.backend import Reconstruction
+from specimap_core.reconstruct.backends.mast3r.backend import LICENCE
+from specimap_core.reconstruct.backends.mast3r.maps import bytes_of
+from specimap_core.reconstruct.backends.mast3r.settings import Mast3rSettings
 
 FRAME = Pose(rotation_from_vector(np.array([0.3, -1.1, 0.7])), np.array([20.0, -5.0, 90.0]))
 """Between the phantom's world and that of the predictions."""

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from specimap.core.errors import BackendUnavailableError
-from specimap.core.reconstruct.mast3r.checkpoint import network_arguments, read_checkpoint
+from specimap_core.errors import BackendUnavailableError
+from specimap_core.reconstruct.backends.mast3r.checkpoint import network_arguments, read_checkpoint
 
 PUBLISHED = (
     "AsymmetricMASt3R(pos_embed='RoPE100', patch_embed_cls='ManyAR_PatchEmbed', img_size=(512, 512), "

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from specimap.core.errors import DepthNotFoundError, PhotosNotConnectedError, SettingsError
-from specimap.core.geometry import Floats
-from specimap.core.reconstruct.mast3r.child import STEPS, TypedFailures, bars, require_finite
-from specimap.core.reconstruct.mast3r.images import plan_preparation
-from specimap.core.reconstruct.mast3r.metric import network_lens
-from specimap.core.reconstruct.mast3r.settings import VARIABLES, Mast3rSettings, settings_from_environment
+from specimap_core.errors import DepthNotFoundError, PhotosNotConnectedError, SettingsError
+from specimap_core.geometry.cameras import Floats
+from specimap_core.reconstruct.backends.mast3r.child import STEPS, TypedFailures, bars, require_finite
+from specimap_core.reconstruct.backends.mast3r.images import plan_preparation
+from specimap_core.reconstruct.backends.mast3r.metric import network_lens
+from specimap_core.reconstruct.backends.mast3r.settings import VARIABLES, Mast3rSettings, settings_from_environment
 
 SIZES = [
     (512, 512),

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from backend_files import bring_mast3r
 from mast3r_scene import (
     CLOSE_MM,
@@ -20,14 +21,15 @@ from mast3r_scene import (
     true_points,
 )
 from scenes import SMALL, OnDisk
-
-from specimap.core.adjust import AdjustSettings
-from specimap.core.evidence.truth import judge
-from specimap.core.geometry import Pose, fit_similarity, rotation_from_vector
-from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline
-from specimap.core.reconstruct.backend import ReconstructSettings
-from specimap.core.reconstruct.mast3r import backend
-from specimap.core.reconstruct.mast3r.settings import PREFIX, Mast3rSettings
+from specimap_core.bundle_adjust.adjust import AdjustSettings
+from specimap_core.geometry.cameras import Pose, fit_similarity, rotation_from_vector
+from specimap_core.pipeline.outputs import Inputs
+from specimap_core.pipeline.run import run_pipeline
+from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.reconstruct.backend import ReconstructSettings
+from specimap_core.reconstruct.backends.mast3r import backend
+from specimap_core.reconstruct.backends.mast3r.settings import PREFIX, Mast3rSettings
+from specimap_core.truth.judge import judge
 
 FRAME = Pose(rotation_from_vector(np.array([-0.6, 0.2, 1.3])), np.array([3.0, 40.0, -70.0]))
 """Between the phantom's world and that of the predictions."""
@@ -118,7 +120,7 @@ def test_a_run_with_free_corners_goes_the_published_way(
     monkeypatch.setenv(PREFIX + "SIZE_PX", "192")
     monkeypatch.setattr(backend, "CHILD", SCRIPT)
     # The script needs none of what a real network would import.
-    monkeypatch.setattr("specimap.core.reconstruct.learned.required.check_backend", lambda name: None)
+    monkeypatch.setattr("specimap_core.reconstruct.backends.requirements.check_backend", lambda name: None)
     settings = PipelineSettings(reconstruct=ReconstructSettings(backend="mast3r"), adjust=AdjustSettings("free"))
     report = run_pipeline(Inputs(small.photos, small.header), tmp_path / "out", settings, workers=2)
     assert (report.backend, report.adjustment) == ("mast3r", "free")

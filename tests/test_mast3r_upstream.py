@@ -10,18 +10,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mast3r_scene import Seen, adjusted_errors_mm, see, upstream
 from PIL import Image
-from scenes import SMALL, OnDisk, phantom_on_disk
 
-from specimap.core.errors import BackendUnavailableError, DepthNotFoundError, PhotosNotConnectedError
-from specimap.core.evidence.truth import judge
-from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline
-from specimap.core.reconstruct.backend import ReconstructSettings
-from specimap.core.reconstruct.learned.process import Answer, run_child
-from specimap.core.reconstruct.mast3r import backend
-from specimap.core.reconstruct.mast3r.images import plan_preparation
-from specimap.core.reconstruct.mast3r.settings import PREFIX
+from mast3r_scene import Seen, adjusted_errors_mm, see, upstream
+from scenes import SMALL, OnDisk, phantom_on_disk
+from specimap_core.errors import BackendUnavailableError, DepthNotFoundError, PhotosNotConnectedError
+from specimap_core.pipeline.outputs import Inputs
+from specimap_core.pipeline.run import run_pipeline
+from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.reconstruct.backend import ReconstructSettings
+from specimap_core.reconstruct.backends.mast3r import backend
+from specimap_core.reconstruct.backends.mast3r.images import plan_preparation
+from specimap_core.reconstruct.backends.mast3r.settings import PREFIX
+from specimap_core.sandbox.process import Answer, run_child
+from specimap_core.truth.judge import judge
 
 HERE = Path(__file__).parent
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -138,7 +140,7 @@ def with_oracle(folder: Path, monkeypatch: pytest.MonkeyPatch, bare: int) -> tup
         monkeypatch.setenv(name, value)
     monkeypatch.setattr(backend, "CHILD", HERE / "mast3r_oracle.py")
     # The oracle brings its own stand-in for torchvision.
-    monkeypatch.setattr("specimap.core.reconstruct.learned.required.check_backend", lambda name: None)
+    monkeypatch.setattr("specimap_core.reconstruct.backends.requirements.check_backend", lambda name: None)
     return disk, seen
 
 

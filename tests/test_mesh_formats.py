@@ -11,10 +11,10 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from specimap.core.errors import CloudDamagedError, SettingsError
-from specimap.core.meshfile import MESH_WRITERS, export_mesh, read_mesh_ply, write_mesh_ply
-from specimap.core.native import open3d
-from specimap.core.surface import Mesh
+from specimap_core.errors import CloudDamagedError, SettingsError
+from specimap_core.native import open3d
+from specimap_core.surface.fusion import Mesh
+from specimap_core.surface.mesh_files import MESH_WRITERS, export_mesh, read_mesh_ply, write_mesh_ply
 
 
 @pytest.fixture(scope="module")

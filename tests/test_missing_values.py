@@ -11,20 +11,20 @@ import httpx
 import numpy as np
 import pyarrow as pa
 import pytest
-from cloud_scene import FakeCube, scene
 from PIL import Image
+
+from cloud_scene import FakeCube, scene
 from result_scene import Result, put_result
 from service_scene import Running
 from specimap_client._models import Point
-
-from specimap.core.cloud import Cloud, Flag
-from specimap.core.cloud.writer import write_cloud
-from specimap.core.cube import open_cube
-from specimap.core.export import export_cloud
-from specimap.core.geometry import Array
-from specimap.core.preview import write_preview
-from specimap.core.register.cube_markers import cleaned, find_in_image
-from specimap.service.answers import ARROW, NPY
+from specimap_core.cloud import Cloud, Flag
+from specimap_core.cloud.preview import write_preview
+from specimap_core.cloud.writer import write_cloud
+from specimap_core.cube import open_cube
+from specimap_core.export import export_cloud
+from specimap_core.geometry.cameras import Array
+from specimap_core.register.cube_markers import cleaned, find_in_image
+from specimap_service.array_responses import ARROW, NPY
 
 ROWS, COLS, BANDS = 40, 36, 5
 

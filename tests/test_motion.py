@@ -8,20 +8,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scenes import SMALL, Finished, bump_mesh, phantom_on_disk
 
-from specimap.core.accuracy import CornersInCube
-from specimap.core.cube import Cube, open_cube
-from specimap.core.geometry import Floats, Intrinsics, Pose, View, look_at, rotation_from_vector
-from specimap.core.phantom import Phantom, PhantomSettings, write_cube
-from specimap.core.phantom.noise import NoiseVolume
-from specimap.core.pipeline import Inputs, Outputs, PipelineSettings, run_pipeline
-from specimap.core.pipeline.artefacts import Stage2, load_stage2
-from specimap.core.raycast import RayCaster
-from specimap.core.register.camera import solve_camera
-from specimap.core.register.cube_markers import find_markers
-from specimap.core.register.motion import ALLOWED_MM, Shift, specimen_shift
-from specimap.core.surface import Mesh, vertex_normals
+from scenes import SMALL, Finished, bump_mesh, phantom_on_disk
+from specimap_core.cube import Cube, open_cube
+from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, View, look_at, rotation_from_vector
+from specimap_core.pipeline.artefacts import Stage2, load_stage2
+from specimap_core.pipeline.outputs import Inputs, Outputs
+from specimap_core.pipeline.run import run_pipeline
+from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.register.accuracy import CornersInCube
+from specimap_core.register.cube_camera import solve_camera
+from specimap_core.register.cube_markers import find_markers
+from specimap_core.register.specimen_motion import ALLOWED_MM, Shift, specimen_shift
+from specimap_core.surface.fusion import Mesh, vertex_normals
+from specimap_core.surface.raycast import RayCaster
+from specimap_validation.phantom import Phantom, PhantomSettings, write_cube
+from specimap_validation.phantom.noise import NoiseVolume
 
 LARGER = replace(SMALL, cube_rows=256, cube_cols=320, bands=6)
 """The small phantom under a finer cube; its photos, and so its mesh, are those of the small one."""

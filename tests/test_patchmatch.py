@@ -12,10 +12,11 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 
-from specimap.core.geometry import Intrinsics, Pose, View, look_at
-from specimap.core.reconstruct import patchmatch
-from specimap.core.reconstruct.depth import DepthSettings, choose_pairs
-from specimap.core.reconstruct.patchmatch_child import (
+from specimap_core.geometry.cameras import Intrinsics, Pose, View, look_at
+from specimap_core.reconstruct.dense import patchmatch
+from specimap_core.reconstruct.dense.depth_map import DepthSettings
+from specimap_core.reconstruct.dense.pairs import choose_pairs
+from specimap_core.reconstruct.dense.patchmatch_child import (
     WATCH_SECONDS,
     depth_file,
     image_name,
@@ -23,7 +24,7 @@ from specimap.core.reconstruct.patchmatch_child import (
     run,
     write_workspace,
 )
-from specimap.core.reconstruct.volume import Volume
+from specimap_core.reconstruct.dense.volume import Volume
 
 LENS = Intrinsics(200, 160, 300.0, 101.5, 77.25, 0.08, -0.02)
 UP = np.array([0.0, 0, 1])

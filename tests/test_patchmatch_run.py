@@ -10,20 +10,22 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from scenes import SMALL, OnDisk
-from true_depth import true_depth
 
-from specimap.core.acquisition import AcquisitionSettings, read_photos
-from specimap.core.errors import BackendFailedError, BackendUnavailableError, CancelledError
-from specimap.core.evidence.truth import judge
-from specimap.core.geometry import Floats
-from specimap.core.phantom import Phantom
-from specimap.core.photofolder import photo_paths
-from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline
-from specimap.core.reconstruct import patchmatch
-from specimap.core.reconstruct.dense import dense_depth
-from specimap.core.reconstruct.depth import DepthMap, DepthSettings
-from specimap.core.reconstruct.volume import volume_over
+from scenes import SMALL, OnDisk
+from specimap_core.errors import BackendFailedError, BackendUnavailableError, CancelledError
+from specimap_core.geometry.cameras import Floats
+from specimap_core.photos.folder import photo_paths
+from specimap_core.photos.reading import AcquisitionSettings, read_photos
+from specimap_core.pipeline.outputs import Inputs
+from specimap_core.pipeline.run import run_pipeline
+from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.reconstruct.dense import patchmatch
+from specimap_core.reconstruct.dense.depth_map import DepthMap, DepthSettings
+from specimap_core.reconstruct.dense.multi_view import dense_depth
+from specimap_core.reconstruct.dense.volume import volume_over
+from specimap_core.truth.judge import judge
+from specimap_validation.phantom import Phantom
+from true_depth import true_depth
 
 
 class Scene:

@@ -8,12 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from scenes import SMALL
 
-from specimap.core.errors import SettingsError
-from specimap.core.phantom import Phantom, build_scene, write_phantom
-from specimap.core.phantom.settings import Stream
-from specimap.core.phantom.specimen import displacement
+from scenes import SMALL
+from specimap_core.errors import SettingsError
+from specimap_validation.phantom import Phantom, build_scene, write_phantom
+from specimap_validation.phantom.settings import Stream
+from specimap_validation.phantom.specimen import displacement
 
 STILL = replace(SMALL, photos=2, photo_size=96, cube_rows=96, cube_cols=120, bands=6, mesh_divisions=48)
 MOVED = replace(STILL, moved_mm=(2.0, -1.5, 0.3), moved_deg=5.0, moved_tilt_deg=2.0)

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scenes import SMALL
 
-from specimap.core.geometry import Floats, Intrinsics, View, look_at
-from specimap.core.phantom import MATERIALS, Paint, Phantom, load_truth, render_view
-from specimap.core.phantom.materials import BLACK_INK
+from scenes import SMALL
+from specimap_core.geometry.cameras import Floats, Intrinsics, View, look_at
+from specimap_validation.phantom import MATERIALS, Paint, Phantom, load_truth, render_view
+from specimap_validation.phantom.materials import BLACK_INK
 
 
 @pytest.fixture(scope="module")

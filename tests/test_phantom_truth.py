@@ -8,11 +8,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from scenes import SMALL
 
-from specimap.core.errors import NotFoundError, SettingsError, UnknownDictionaryError
-from specimap.core.phantom import MATERIALS, Phantom, build_scene, endmembers, load_truth, write_phantom
-from specimap.core.phantom.specimen import build_specimen, cube_sphere
+from scenes import SMALL
+from specimap_core.errors import NotFoundError, SettingsError, UnknownDictionaryError
+from specimap_validation.phantom import MATERIALS, Phantom, build_scene, endmembers, load_truth, write_phantom
+from specimap_validation.phantom.specimen import build_specimen, cube_sphere
 
 TINY = replace(SMALL, photos=2, photo_size=96, cube_rows=48, cube_cols=64, bands=5, mesh_divisions=16)
 

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps
-from test_acquisition import SETTINGS, pattern
 
-from specimap.core.acquisition import AcquisitionSettings, read_photo, read_photos
-from specimap.core.errors import PhotoRawError, PhotoUnreadableError, SpecimapError
-from specimap.core.intake.photo import Others, judge_photo
-from specimap.core.photofile import decode_photo, photo_suffix
-from specimap.core.photofolder import photo_folder, photo_paths
-from specimap.core.photoformats import FORMATS, MEDIA_TYPES, PHOTO_SUFFIXES, suffix_of
+from specimap_core.errors import PhotoRawError, PhotoUnreadableError, SpecimapError
+from specimap_core.photos.decoding import decode_photo, photo_suffix
+from specimap_core.photos.folder import photo_folder, photo_paths
+from specimap_core.photos.formats import FORMATS, MEDIA_TYPES, PHOTO_SUFFIXES, suffix_of
+from specimap_core.photos.reading import AcquisitionSettings, read_photo, read_photos
+from specimap_core.screening.photo import Others, judge_photo
+from test_acquisition import SETTINGS, pattern
 
 WITH_EXIF = ["JPEG", "MPO", "HEIF", "PNG", "TIFF", "WEBP", "AVIF"]
 UPRIGHT: dict[int, Any] = {

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from specimap.core.errors import PhotoUnreadableError
-from specimap.core.photosheet import TILE_PX, SheetLayout, contact_sheet, read_tiles
+from specimap_core.errors import PhotoUnreadableError
+from specimap_core.photos.contact_sheet import TILE_PX, SheetLayout, contact_sheet, read_tiles
 
 JPEG_STEPS = 12
 """Colours of even fields come back within the quantisation of JPEG at this quality, also across the tiles' borders."""

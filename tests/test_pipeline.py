@@ -9,15 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import Finished, OnDisk, assert_same_result, read_corners
 
-from specimap.core.accuracy import TruthComparison, compare_with_truth
-from specimap.core.acquisition import AcquisitionSettings
-from specimap.core.cloud import Cloud, Flag
-from specimap.core.errors import CancelledError
-from specimap.core.phantom import load_truth
-from specimap.core.phantom.truth import Truth
-from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline
+from scenes import Finished, OnDisk, assert_same_result, read_corners
+from specimap_core.cloud import Cloud, Flag
+from specimap_core.errors import CancelledError
+from specimap_core.photos.reading import AcquisitionSettings
+from specimap_core.pipeline.outputs import Inputs
+from specimap_core.pipeline.run import run_pipeline
+from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.truth.judge import TruthComparison, compare_with_truth
+from specimap_core.truth.truth_file import Truth
+from specimap_validation.phantom import load_truth
 
 
 def judged(out: Path, truth: Truth) -> TruthComparison:

@@ -7,14 +7,17 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pytest
-from feature_scene import Ring, ring
 
-from specimap.core.acquisition import Photo
-from specimap.core.errors import BackendUnavailableError, TooFewPhotosError
-from specimap.core.reconstruct import features, posing, reaching
-from specimap.core.reconstruct.backend import CornersInPhotos, FeatureChoice, ReconstructSettings
-from specimap.core.reconstruct.features import FeatureKind, Features, Sift
-from specimap.core.reconstruct.posing import Posed, pose_photos
+from feature_scene import Ring, ring
+from specimap_core.errors import BackendUnavailableError, TooFewPhotosError
+from specimap_core.photos.reading import Photo
+from specimap_core.reconstruct import poses as posing
+from specimap_core.reconstruct import poses_from_features
+from specimap_core.reconstruct.backend import CornersInPhotos, FeatureChoice, ReconstructSettings
+from specimap_core.reconstruct.features import sift
+from specimap_core.reconstruct.features.base import FeatureKind, Features
+from specimap_core.reconstruct.features.sift import Sift
+from specimap_core.reconstruct.poses import Posed, pose_photos
 
 SHOWN = [0, 1, 2, 3]
 ALL = list(range(10))
@@ -44,12 +47,12 @@ def kinds_are(monkeypatch: pytest.MonkeyPatch, **kinds: type[Sift]) -> list[str]
         asked.append(name)
         return kinds[name](workers)
 
-    monkeypatch.setattr(reaching, "feature_kind", make)
+    monkeypatch.setattr(poses_from_features, "feature_kind", make)
     return asked
 
 
 def installed(monkeypatch: pytest.MonkeyPatch, *missing: str) -> None:
-    monkeypatch.setattr(features, "find_spec", lambda name: None if name in missing else object())
+    monkeypatch.setattr(sift, "find_spec", lambda name: None if name in missing else object())
 
 
 def test_where_markers_suffice_no_features_are_looked_at(scene: Ring, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -96,7 +99,7 @@ def test_auto_takes_a_pose_of_few_matches_only_where_aliked_finds_none(
     scene: Ring, monkeypatch: pytest.MonkeyPatch, second: type[Sift]
 ) -> None:
     installed(monkeypatch)
-    monkeypatch.setattr(reaching, "SURE_INLIERS", 10_000)
+    monkeypatch.setattr(poses_from_features, "SURE_INLIERS", 10_000)
     asked = kinds_are(monkeypatch, sift=Sift, aliked=second)
     posed = pose(scene, scene.shown_in(SHOWN))
     assert asked == (["sift", "aliked"] if second is Sift else ["sift", "aliked", "sift"])
@@ -107,7 +110,7 @@ def test_auto_takes_a_pose_of_few_matches_only_where_aliked_finds_none(
 
 def test_without_aliked_a_pose_of_few_matches_is_taken_at_once(scene: Ring, monkeypatch: pytest.MonkeyPatch) -> None:
     installed(monkeypatch, "torch")
-    monkeypatch.setattr(reaching, "SURE_INLIERS", 10_000)
+    monkeypatch.setattr(poses_from_features, "SURE_INLIERS", 10_000)
     asked = kinds_are(monkeypatch, sift=Sift)
     posed = pose(scene, scene.shown_in(SHOWN))
     assert asked == ["sift"]

@@ -8,14 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from cloud_scene import FakeCube, counts, scene
 from numpy.typing import NDArray
 
-from specimap.core import preview
-from specimap.core.cloud import Cloud
-from specimap.core.cloud.writer import write_cloud
-from specimap.core.errors import SettingsError
-from specimap.core.preview import pca_colours, write_preview
+from cloud_scene import FakeCube, counts, scene
+from specimap_core.cloud import Cloud, preview
+from specimap_core.cloud.preview import pca_colours, write_preview
+from specimap_core.cloud.writer import write_cloud
+from specimap_core.errors import SettingsError
 
 
 def read(path: Path) -> NDArray[np.uint8]:

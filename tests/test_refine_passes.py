@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from matched_scene import Matched, matched
 from numpy.typing import NDArray
 
-from specimap.core.errors import CancelledError
-from specimap.core.points import worth_refining
-from specimap.core.refine import Pass, Refined, RefineSettings, pixel_footprint_mm, refine_mesh
-from specimap.core.surface import Mesh
-from specimap.core.uncertainty import LEAST_SIGMA_MM
+from matched_scene import Matched, matched
+from specimap_core.errors import CancelledError
+from specimap_core.surface.fusion import Mesh
+from specimap_core.surface.refinement import Pass, Refined, RefineSettings, pixel_footprint_mm, refine_mesh
+from specimap_core.surface.regions import worth_refining
+from specimap_core.surface.uncertainty import LEAST_SIGMA_MM
 
 SEEDS = (31, 32)
 SETTINGS = RefineSettings()

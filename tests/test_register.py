@@ -8,17 +8,17 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scenes import bump_height, bump_mesh
 
-from specimap.core.errors import DuplicateMarkersError, MarkersMissingInCubeError, RegistrationError
-from specimap.core.fiducials import dictionary_named
-from specimap.core.geometry import Array, Floats, Intrinsics, View, look_at
-from specimap.core.raycast import RayCaster
-from specimap.core.register.camera import solve_camera
-from specimap.core.register.cube_markers import find_markers, stretched
-from specimap.core.register.models import FOCAL_PRIOR_SD
-from specimap.core.register.register import fit_homography, place_by_camera, place_by_homography
-from specimap.core.render import render_grid
+from scenes import bump_height, bump_mesh
+from specimap_core.errors import DuplicateMarkersError, MarkersMissingInCubeError, RegistrationError
+from specimap_core.fiducials.detection import dictionary_named
+from specimap_core.geometry.cameras import Array, Floats, Intrinsics, View, look_at
+from specimap_core.register.camera_models import FOCAL_PRIOR_SD
+from specimap_core.register.cube_camera import solve_camera
+from specimap_core.register.cube_markers import find_markers, stretched
+from specimap_core.register.placement import fit_homography, place_by_camera, place_by_homography
+from specimap_core.render.orthographic import render_grid
+from specimap_core.surface.raycast import RayCaster
 
 ROWS, COLS = 120, 150
 VIEW = View(

@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from specimap.core.evidence.truth import judge_with_sigma
-from specimap.core.phantom import PhantomSettings, write_phantom
-from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline
+from specimap_core.pipeline.outputs import Inputs
+from specimap_core.pipeline.run import run_pipeline
+from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.truth.judge import judge_with_sigma
+from specimap_validation.phantom import PhantomSettings, write_phantom
 
 MEDIUM: dict[str, Any] = {
     "photos": 18,

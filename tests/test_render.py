@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scenes import bump_height, bump_mesh
 
-from specimap.core.errors import SettingsError
-from specimap.core.raycast import RayCaster
-from specimap.core.render import extent_of, render_grid
+from scenes import bump_height, bump_mesh
+from specimap_core.errors import SettingsError
+from specimap_core.render.orthographic import extent_of, render_grid
+from specimap_core.surface.raycast import RayCaster
 
 LOW, HIGH = np.array([-20.13, -15.21]), np.array([19.87, 14.79])  # off the mesh's own vertices
 

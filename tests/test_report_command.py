@@ -11,16 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
-from document_scene import Page
-from scenes import Answer, Finished, OnDisk
 from typer.testing import CliRunner
 
-from specimap.cli.report import report as report_command
-from specimap.core.evidence.truth import judge
-from specimap.core.geometry import Floats
-from specimap.core.photosheet import read_tiles
-from specimap.core.pipeline import Outputs
-from specimap.core.report import PhotoCorners, Report
+from document_scene import Page
+from scenes import Answer, Finished, OnDisk
+from specimap_cli.report import report as report_command
+from specimap_core.geometry.cameras import Floats
+from specimap_core.photos.contact_sheet import read_tiles
+from specimap_core.pipeline.outputs import Outputs
+from specimap_core.report.model import PhotoCorners, Report
+from specimap_core.truth.judge import judge
 
 ROUNDED_PX = 0.005
 CORNERS_ROUNDED_PX = 0.05

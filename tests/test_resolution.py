@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from test_fiducials import LAYOUT, picture
 
-from specimap.core.acquisition import Photo
-from specimap.core.colour import linear_from_srgb
-from specimap.core.edges import edge_blurs
-from specimap.core.fiducials import detect_markers
-from specimap.core.reconstruct.resolution import LEAST_PX, SHARP_PX, at_own_resolution, own_resolution
+from specimap_core.fiducials.detection import detect_markers
+from specimap_core.fiducials.subpixel import edge_blurs
+from specimap_core.photos.colour import linear_from_srgb
+from specimap_core.photos.reading import Photo
+from specimap_core.reconstruct.photo_resolution import LEAST_PX, SHARP_PX, at_own_resolution, own_resolution
+from test_fiducials import LAYOUT, picture
 
 SHAPE = (780, 1040)
 LARGE = {k: 2.6 * (corners + 0.5) - 0.5 for k, corners in LAYOUT.items()}

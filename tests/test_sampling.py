@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from specimap.core.sampling import MOST, ROW, sample
+from specimap_core.geometry.image_sampling import MOST, ROW, sample
 
 STEP = 1 / 32
 """OpenCV rounds places to this."""

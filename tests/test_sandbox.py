@@ -14,20 +14,20 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import escapes
 import pytest
 
-from specimap.core.errors import SettingsError
-from specimap.core.reconstruct.learned.environment import BACKEND_VARIABLES
-from specimap.core.sandbox import Mode, Protection, Reach, confined, program_rules, protection
-from specimap.core.sandbox.launch import NOT_CONFINED
-from specimap.core.sandbox.places import interpreter_places
-from specimap.infra import confinement
-from specimap.infra.confinement import check_confinement
-from specimap.infra.settings import load_settings
-from specimap.service.judging import Judge
-from specimap.workers.cells import Cells, is_plain
-from specimap.workers.processes import Processes
+import escapes
+from specimap_core.errors import SettingsError
+from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES
+from specimap_core.sandbox import Mode, Protection, Reach, confined, program_rules, protection
+from specimap_core.sandbox.launch import NOT_CONFINED
+from specimap_core.sandbox.places import interpreter_places
+from specimap_infra import confinement
+from specimap_infra.confinement import check_confinement
+from specimap_infra.settings import load_settings
+from specimap_service.acquisitions.judge import Judge
+from specimap_workers.stage_process import Processes
+from specimap_workers.workspaces import Cells, is_plain
 
 pytestmark = pytest.mark.skipif(not protection().whole, reason="this kernel does not confine")
 
@@ -35,8 +35,8 @@ TEXT = Path(escapes.__file__).read_text("utf-8")
 
 JUDGING = f"""{TEXT}
 import json
-from specimap.core.intake import __main__ as child
-from specimap.core.intake.verdict import Verdict
+from specimap_core.screening import __main__ as child
+from specimap_core.screening.verdict import Verdict
 
 def escape(task):
     told = json.loads(Path(task["path"]).read_text())
@@ -48,7 +48,7 @@ child.main()
 """
 STAGE = f"""{TEXT}
 import json
-from specimap.workers import stage_main
+from specimap_workers import stage_main
 
 def escape(spec, out):
     found = tried({{**json.loads((Path(spec["inputs"]["photos"]) / "told").read_text()), "own": spec["out"]}})
@@ -336,7 +336,7 @@ def test_without_landlock_what_there_is_holds(version: int, tmp_path: Path) -> N
     (tmp_path / "folder").mkdir()
     program = (
         "import os, socket, sys\n"
-        "from specimap.core.sandbox import Confinement, landlock\n"
+        "from specimap_core.sandbox import Confinement, landlock\n"
         f"landlock.abi = lambda: {version}\n"
         "Confinement([], sys.argv[1]).enter(alone=False)\n"
         "os.rename('file', 'folder/file')\n"

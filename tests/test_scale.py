@@ -7,16 +7,16 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from scenes import marker_scene
 
-from specimap.core.errors import EdgeImplausibleError, SettingsError
-from specimap.core.geometry import Floats, Pose
-from specimap.core.limits import RANGES, advice_on
-from specimap.core.pipeline.scale import check_scale, reach_mm
-from specimap.core.pipeline.settings import PipelineSettings
-from specimap.core.render import RenderSettings
-from specimap.infra.job_models import EdgeMm, JobSettings
-from specimap.service.routers.acquisitions import AcquisitionRequest
+from scenes import marker_scene
+from specimap_core.errors import EdgeImplausibleError, SettingsError
+from specimap_core.geometry.cameras import Floats, Pose
+from specimap_core.pipeline.limits import RANGES, advice_on
+from specimap_core.pipeline.scale_check import check_scale, reach_mm
+from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.render.orthographic import RenderSettings
+from specimap_infra.job_schemas import EdgeMm, JobSettings
+from specimap_service.acquisitions.routes import AcquisitionRequest
 
 
 def scene(factor: float) -> tuple[tuple[Pose, ...], Floats]:

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import SMALL
 
-from specimap.core.errors import SettingsError
-from specimap.core.geometry import Intrinsics, Pose, View, look_at, rotation_from_vector
-from specimap.core.phantom import Phantom, PhantomSettings, load_truth
-from specimap.core.phantom.truth import save_truth
-from specimap.core.phantom.views import WobblyScan, hsi_view
-from specimap.core.register.models import NUMBERS, SCANS, STEPS, Flat, at_markers, moved
-from specimap.core.scan import Axis, ScanView
+from scenes import SMALL
+from specimap_core.errors import SettingsError
+from specimap_core.geometry.cameras import Intrinsics, Pose, View, look_at, rotation_from_vector
+from specimap_core.geometry.pushbroom import Axis, ScanView, WobblyScan
+from specimap_core.register.camera_models import NUMBERS, SCANS, STEPS, Flat, at_markers, moved
+from specimap_core.truth.truth_file import save_truth
+from specimap_validation.phantom import Phantom, PhantomSettings, load_truth
+from specimap_validation.phantom.views import hsi_view
 
 POINTS = np.random.default_rng(0).uniform([-25, -25, 0], [25, 25, 14], (200, 3))
 AXES: tuple[Axis, ...] = ("rows", "columns")

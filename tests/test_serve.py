@@ -15,15 +15,15 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
+
 from scenes import OnDisk
 from specimap_client import Client
+from specimap_core.cloud import Cloud
+from specimap_core.report.model import Report
 from worker_scene import processes_of, until
 
-from specimap.core.cloud import Cloud
-from specimap.core.report import Report
-
 ROOT = Path(__file__).parents[1]
-PROGRAM = (sys.executable, "-c", "from specimap.cli import main; main()")
+PROGRAM = (sys.executable, "-c", "from specimap_cli import main; main()")
 
 
 @dataclass
@@ -84,7 +84,7 @@ def test_first_start_tells_address_and_key_and_the_second_only_the_address(tmp_p
             assert [k.name for k in client.keys.list()] == ["administrator"]
         first.process.send_signal(signal.SIGTERM)
         assert first.process.wait(20) == 0
-        assert not processes_of(["specimap.workers", str(first.process.pid)])
+        assert not processes_of(["specimap_workers", str(first.process.pid)])
     assert (tmp_path / "data").stat().st_mode & 0o077 == 0
     with running(tmp_path / "data") as second:
         url = second.printed("Specimap listens on ")
@@ -130,7 +130,7 @@ def test_no_job_is_lost_when_everything_is_killed_at_once(tmp_path: Path, small:
             until(lambda: client.jobs.get(jobs[0]).stage == "adjust", 60, "the second stage")
         first.process.kill()
         first.process.wait(10)
-        until(lambda: not processes_of(["specimap.workers", str(first.process.pid)]), 5, "the worker's end")
+        until(lambda: not processes_of(["specimap_workers", str(first.process.pid)]), 5, "the worker's end")
     with running(tmp_path / "data") as second, Client(second.printed("Specimap listens on "), key) as client:
         ended = [client.jobs.wait(job, timeout=120) for job in jobs]
         assert [job.state for job in ended] == ["succeeded"] * 3

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
-from service_scene import Running, serving
-from upload_scene import SAMPLES, created, new_acquisition, patch, photos, send, sent
 
-from specimap.infra.database import utc_now
-from specimap.infra.ids import new_id
-from specimap.infra.models import Base, CloudRow, Job, JobEvent
+from service_scene import Running, serving
+from specimap_infra.database import utc_now
+from specimap_infra.ids import new_id
+from specimap_infra.tables import Base, CloudRow, Job, JobEvent
+from upload_scene import SAMPLES, created, new_acquisition, patch, photos, send, sent
 
 Parts = list[tuple[str, tuple[str | None, bytes | str]]]
 PHOTO = photos()[0].read_bytes()

@@ -12,17 +12,17 @@ import httpx
 import numpy as np
 import pytest
 import zarr
-from cloud_scene import FakeCube, counts
 from numpy.typing import NDArray
-from object_store import object_store
 from obstore.store import HTTPStore
-from result_scene import put_label, put_result
-from service_scene import Running, serving
-from spectra_scene import BANDS, large_cloud, table_of
 from zarr.storage import ObjectStore
 
-from specimap.core.cloud import Cloud
-from specimap.service.answers import ARROW, JSON, NPY
+from cloud_scene import FakeCube, counts
+from object_store import object_store
+from result_scene import put_label, put_result
+from service_scene import Running, serving
+from specimap_core.cloud import Cloud
+from specimap_service.array_responses import ARROW, JSON, NPY
+from spectra_scene import BANDS, large_cloud, table_of
 
 
 class UnknownWavelengths(FakeCube):

@@ -11,11 +11,11 @@ from typing import Any
 
 import httpx
 import pytest
-from service_scene import Running, serving
-from upload_scene import SAMPLES, client_at, key_in, new_acquisition, process_serving
 
-from specimap.service.bodies import FILES, LARGEST_JSON, LARGEST_SELECTION, SELECTIONS, most_bytes
-from specimap.service.multipart import LONGEST_HEADER, MOST_BESIDE, MOST_HEADERS
+from service_scene import Running, serving
+from specimap_service.json_limit import FILES, LARGEST_JSON, LARGEST_SELECTION, SELECTIONS, most_bytes
+from specimap_service.uploads.multipart import LONGEST_HEADER, MOST_BESIDE, MOST_HEADERS
+from upload_scene import SAMPLES, client_at, key_in, new_acquisition, process_serving
 
 CLOUD = f"/v1/clouds/cloud_{'0' * 26}/spectra"
 KINDS = ("application/octet-stream", "application/json", "multipart/form-data; boundary=b", "text/plain", "")

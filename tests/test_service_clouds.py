@@ -10,14 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sqlalchemy as sa
+
 from result_scene import Result, put_label, put_result
 from service_scene import Running
-
-from specimap.core.cloud import Cloud
-from specimap.core.errors import NotFoundError
-from specimap.infra.models import Acquisition, CloudRow
-from specimap.service import auth, clouds
-from specimap.service.clouds import OpenClouds
+from specimap_core.cloud import Cloud
+from specimap_core.errors import NotFoundError
+from specimap_infra.tables import Acquisition, CloudRow
+from specimap_service.auth import keys
+from specimap_service.clouds import open_clouds as clouds
+from specimap_service.clouds.open_clouds import OpenClouds
 
 
 @pytest.fixture
@@ -101,7 +102,7 @@ def test_reading_needs_its_scope(service: Running, result: Result) -> None:
 
 
 def test_a_warm_spectrum_asks_no_database(service: Running, result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(auth, "KEPT_SECONDS", 600.0)
+    monkeypatch.setattr(keys, "KEPT_SECONDS", 600.0)
     monkeypatch.setattr(clouds, "KEPT_SECONDS", 600.0)
     reader = service.client(("read",))
     statements: list[str] = []

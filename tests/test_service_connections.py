@@ -9,10 +9,10 @@ from pathlib import Path
 
 import httpx
 import pytest
-from service_scene import Running, serving
 
-from specimap.service import connections
-from specimap.service.connections import LARGEST_HEAD
+from service_scene import Running, serving
+from specimap_service import connections
+from specimap_service.connections import LARGEST_HEAD
 
 PIECE = b"a" * 16384
 ENDLESS = {

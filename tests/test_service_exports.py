@@ -15,17 +15,17 @@ import sqlalchemy as sa
 import trimesh
 import xarray
 import zarr
+
 from export_scene import address, make
 from result_scene import Result, put_result
 from service_scene import Running
+from specimap_core.cloud import Cloud
+from specimap_core.export.formats import KINDS, FileFormat
+from specimap_core.native import open3d
+from specimap_core.surface.mesh_files import read_mesh_ply
+from specimap_infra.queue import EXPORTS, MAKE_EXPORT
+from specimap_workers.export_main import make_export_file
 from test_service_labels import header, layer, npy
-
-from specimap.core.cloud import Cloud
-from specimap.core.export.formats import KINDS, FileFormat
-from specimap.core.meshfile import read_mesh_ply
-from specimap.core.native import open3d
-from specimap.infra.queue import EXPORTS, MAKE_EXPORT
-from specimap.workers.export_main import make_export_file
 
 
 @pytest.fixture

@@ -16,14 +16,14 @@ from typing import Any
 import httpx
 import pytest
 import sqlalchemy as sa
+
 from export_scene import address, make
 from result_scene import Result, put_result
 from service_scene import Running
-
-from specimap.core.errors import CancelledError
-from specimap.infra.models import CloudRow, Export
-from specimap.workers import exports
-from specimap.workers.exports import run_export
+from specimap_core.errors import CancelledError
+from specimap_infra.tables import CloudRow, Export
+from specimap_workers import exports
+from specimap_workers.exports import run_export
 
 
 @pytest.fixture
@@ -213,7 +213,7 @@ def test_the_process_ends_with_its_worker(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "mesh.ply")  # nobody writes to it: reading it waits
     program = (
         "import os, subprocess, sys, time\n"
-        "command = [sys.executable, '-m', 'specimap.workers.export_main', sys.argv[1], 'mesh-stl', sys.argv[2]]\n"
+        "command = [sys.executable, '-m', 'specimap_workers.export_main', sys.argv[1], 'mesh-stl', sys.argv[2]]\n"
         "print(subprocess.Popen([*command, str(os.getpid()), '0']).pid, flush=True)\n"
         "time.sleep(60)\n"
     )
@@ -236,7 +236,7 @@ def test_the_process_ends_with_its_worker(tmp_path: Path) -> None:
 
 def test_the_process_does_nothing_for_a_worker_that_has_gone(result: Result, tmp_path: Path) -> None:
     target = tmp_path / "c.ply"
-    command = [sys.executable, "-m", "specimap.workers.export_main", str(result.local), "ply", str(target), "1", "0"]
+    command = [sys.executable, "-m", "specimap_workers.export_main", str(result.local), "ply", str(target), "1", "0"]
     assert subprocess.run(command, timeout=60).returncode == 1
     assert not target.exists()
 

@@ -18,14 +18,14 @@ import httpx
 import numpy as np
 import pytest
 import tifffile
+
 from service_scene import Running, serving
+from specimap_core.sandbox import protection
+from specimap_infra.settings import load_settings
+from specimap_service.acquisitions.judge import Judge
+from specimap_service.acquisitions.verdicts import LONGEST_TEXT, MOST_ITEMS, checked_verdict
 from upload_scene import new_acquisition, photos, send, sent
 from worker_scene import until
-
-from specimap.core.sandbox import protection
-from specimap.infra.settings import load_settings
-from specimap.service.judging import Judge
-from specimap.service.verdicts import LONGEST_TEXT, MOST_ITEMS, checked_verdict
 
 SHAPE = (6, 5, 4)
 CUBE = np.random.default_rng(0).integers(1, 4000, SHAPE).astype(np.uint16)
@@ -38,8 +38,8 @@ NAIVE = """
 import glob, json, sys
 from pathlib import Path
 import h5py, numpy as np, tifffile
-from specimap.core.intake import __main__ as child
-from specimap.core.intake.verdict import Verdict
+from specimap_core.screening import __main__ as child
+from specimap_core.screening.verdict import Verdict
 
 def whole(task):
     return Verdict(facts={"part": "whole", "suffix": ".tif" if open(task["path"], "rb").read(2) == b"II" else ".h5"})
@@ -287,8 +287,8 @@ def test_an_answer_is_shortened_and_its_wavelengths_are_plausible() -> None:
 
 POISON = """
 import json, os, signal, sys
-from specimap.core.intake import __main__ as child
-from specimap.core.intake.verdict import Verdict
+from specimap_core.screening import __main__ as child
+from specimap_core.screening.verdict import Verdict
 
 def poison(task):
     how = task["path"].rpartition("/")[2]

@@ -9,14 +9,14 @@ from typing import Any
 
 import pytest
 import sqlalchemy as sa
-from job_scene import EXECUTOR, acquisition, events, queued_job, row
-from service_scene import Running, serving
 from sqlalchemy.orm import Session
 
-from specimap.infra import jobs
-from specimap.infra.models import Job, JobEvent
-from specimap.infra.queue import enqueue
-from specimap.service import job_changes
+from job_scene import EXECUTOR, acquisition, events, queued_job, row
+from service_scene import Running, serving
+from specimap_infra import jobs
+from specimap_infra.queue import enqueue
+from specimap_infra.tables import Job, JobEvent
+from specimap_service.jobs import commands
 
 
 @pytest.fixture
@@ -85,7 +85,7 @@ def test_job_and_workflow_are_there_together_or_not_at_all(
         enqueue(*arguments)
         raise OSError("The process dies here.")
 
-    monkeypatch.setattr(job_changes, "enqueue", fails_after)
+    monkeypatch.setattr(commands, "enqueue", fails_after)
     assert client.post("/v1/jobs", json={"acquisition_id": owner}).status_code == 500
     monkeypatch.undo()
     with any_service.database.session() as session:
@@ -242,6 +242,6 @@ def test_deletion_of_the_acquisition_meanwhile_is_told(service: Running, monkeyp
             connection.execute(sa.text("DELETE FROM acquisitions"))
         return []
 
-    monkeypatch.setattr(job_changes, "missing", deletes)
+    monkeypatch.setattr(commands, "missing", deletes)
     answer = service.client().post("/v1/jobs", json={"acquisition_id": owner})
     assert (answer.status_code, answer.json()["code"]) == (404, "not_found")

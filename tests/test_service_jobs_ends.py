@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 import sqlalchemy as sa
+
 from job_scene import EXECUTOR, acquisition, events, queued_job, row
 from service_scene import Running
-
-from specimap.core.report import Report
-from specimap.infra import jobs
-from specimap.infra.ids import new_id
-from specimap.infra.models import Acquisition, CloudRow, Delivery, Export, JobEvent, LabelVersion
+from specimap_core.report.model import Report
+from specimap_infra import jobs
+from specimap_infra.ids import new_id
+from specimap_infra.tables import Acquisition, CloudRow, Delivery, Export, JobEvent, LabelVersion
 
 SPREAD = {"mean": 0.1, "std": 0.1, "n": 4}
 QUARTILES = {"median": 0.1, "q1": 0.1, "q3": 0.2, "n": 4}

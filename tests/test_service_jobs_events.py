@@ -14,14 +14,14 @@ from typing import Any
 import httpx
 import pytest
 import sqlalchemy as sa
+from psycopg import sql
+
 from databases import postgres_server, postgres_url
 from job_scene import EXECUTOR, acquisition, queued_job
-from psycopg import sql
 from service_scene import Running, serving
-
-from specimap.infra import jobs
-from specimap.infra.database import Database
-from specimap.service import job_events
+from specimap_infra import jobs
+from specimap_infra.database import Database
+from specimap_service.jobs import events
 
 Told = tuple[int, str, dict[str, Any]]
 
@@ -110,13 +110,13 @@ def test_stream_is_resumed_after_the_last_event_seen(service: Running) -> None:
 
 def test_many_listeners_cost_one_look_into_the_database(service: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     looks: list[dict[str, int]] = []
-    read = job_events.read_events
+    read = events.read_events
 
-    def counted(database: Database, after: dict[str, int]) -> dict[str, list[job_events.Event]]:
+    def counted(database: Database, after: dict[str, int]) -> dict[str, list[events.Event]]:
         looks.append(after)
         return read(database, after)
 
-    monkeypatch.setattr(job_events, "read_events", counted)
+    monkeypatch.setattr(events, "read_events", counted)
     owner = acquisition(service.database)
     ids = [queued_job(service.database, owner) for _ in range(3)]
     listeners = 45
@@ -142,15 +142,15 @@ def test_many_listeners_cost_one_look_into_the_database(service: Running, monkey
         seconds = time.monotonic() - begun
     for seen in told:
         assert [(seq, type) for seq, type, _ in seen] == expected(20)
-    assert len(looks) <= seconds / job_events.POLL_SECONDS + 4
-    feed: job_events.JobEvents = service.app.state.context.events
+    assert len(looks) <= seconds / events.POLL_SECONDS + 4
+    feed: events.JobEvents = service.app.state.context.events
     until(lambda: not feed._channels)
     until(lambda: feed._poller is not None and feed._poller.done())
     assert service.database.engine.pool.checkedout() == 0  # type: ignore[attr-defined]
 
 
 def test_listener_far_behind_reads_what_is_not_kept(service: Running, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(job_events, "PAGE", 20)
+    monkeypatch.setattr(events, "PAGE", 20)
     job_id = queued_job(service.database)
     client = service.client(["read"])
     with following(client, job_id, {"Last-Event-ID": "1"}) as ahead:
@@ -166,7 +166,7 @@ def test_listener_far_behind_reads_what_is_not_kept(service: Running, monkeypatc
 def test_stream_of_a_deleted_job_ends_and_an_idle_one_is_kept_alive(
     service: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(job_events, "KEEP_ALIVE_SECONDS", 0.2)
+    monkeypatch.setattr(events, "KEEP_ALIVE_SECONDS", 0.2)
     job_id = queued_job(service.database)
     with service.client(["read"]).stream("GET", f"/v1/jobs/{job_id}/events") as answer:
         lines = answer.iter_lines()

@@ -8,18 +8,18 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import sqlalchemy as sa
-from job_scene import EXECUTOR, acquisition, events, queued_job, row
 from sqlalchemy.orm import Session
 
-from specimap.core.acquisition import AcquisitionSettings
-from specimap.core.errors import NotFoundError, TooFewPhotosError
-from specimap.core.fiducials import dictionary_named
-from specimap.infra import jobs
-from specimap.infra.database import Database
-from specimap.infra.errors import JobConflictError, LostLeaseError
-from specimap.infra.job_models import Dictionary
-from specimap.infra.models import FINAL_STATES, JOB_STATES, Delivery, Job, StoredFile
-from specimap.infra.readiness import LEAST_PHOTOS, missing
+from job_scene import EXECUTOR, acquisition, events, queued_job, row
+from specimap_core.errors import NotFoundError, TooFewPhotosError
+from specimap_core.fiducials.detection import dictionary_named
+from specimap_core.photos.reading import AcquisitionSettings
+from specimap_infra import jobs
+from specimap_infra.completeness import LEAST_PHOTOS, missing
+from specimap_infra.database import Database
+from specimap_infra.errors import JobConflictError, LostLeaseError
+from specimap_infra.job_schemas import Dictionary
+from specimap_infra.tables import FINAL_STATES, JOB_STATES, Delivery, Job, StoredFile
 
 WEBHOOK = {"url": "http://127.0.0.1:1/", "secret": "0123456789abcdef"}
 FINALS: tuple[jobs.FinalState, ...] = ("succeeded", "failed", "cancelled")

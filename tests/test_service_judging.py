@@ -17,17 +17,17 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+
 from service_scene import Running
+from specimap_core.errors import BackendUnavailableError
+from specimap_core.photos.reading import AcquisitionSettings, read_photo
+from specimap_core.screening.photo import Others, judge_photo
+from specimap_infra.completeness import LEAST_PHOTOS
+from specimap_infra.settings import load_settings
+from specimap_service.acquisitions.judge import Judge
+from specimap_service.acquisitions.schemas import Dictionary
 from test_acquisition import bomb
 from upload_scene import client_at, key_in, new_acquisition, photos, process_serving, send, sent
-
-from specimap.core.acquisition import AcquisitionSettings, read_photo
-from specimap.core.errors import BackendUnavailableError
-from specimap.core.intake.photo import Others, judge_photo
-from specimap.infra.readiness import LEAST_PHOTOS
-from specimap.infra.settings import load_settings
-from specimap.service.files import Dictionary
-from specimap.service.judging import Judge
 
 Image = NDArray[np.uint8]
 SHARP = photos()
@@ -232,7 +232,7 @@ def test_child_has_no_keys_and_dies_with_the_service(tmp_path: Path) -> None:
             int(child)
             for task in Path(f"/proc/{process.pid}/task").iterdir()
             for child in (task / "children").read_text().split()
-            if b"specimap.core.intake" in Path(f"/proc/{child}/cmdline").read_bytes()
+            if b"specimap_core.screening" in Path(f"/proc/{child}/cmdline").read_bytes()
         ]
         assert 1 <= len(children) <= 2
         environment = Path(f"/proc/{children[0]}/environ").read_bytes()

@@ -10,12 +10,12 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+
 from cube_files import random_values, write_envi
 from service_scene import Running
+from specimap_infra.settings import load_settings
+from specimap_service.acquisitions.judge import Judge
 from upload_scene import SAMPLES, new_acquisition, send, sent
-
-from specimap.infra.settings import load_settings
-from specimap.service.judging import Judge
 
 HEADER = (SAMPLES / "hsi" / "hsi.hdr").read_bytes()
 DATA = (SAMPLES / "hsi" / "hsi.raw").read_bytes()

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import httpx
 import pytest
-from service_scene import Running, serving
 
-from specimap.infra.errors import RateLimitedError
-from specimap.service.limits import RateLimiter
+from service_scene import Running, serving
+from specimap_service.auth.rate_limit import RateLimiter
+from specimap_service.errors import RateLimitedError
 
 
 def test_health_needs_no_key_and_everything_else_does(service: Running) -> None:

@@ -14,11 +14,11 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from numpy.typing import NDArray
+
 from result_scene import Result, put_result
 from service_scene import Running
-
-from specimap.core.cloud import Cloud
-from specimap.core.cloud.labels import GROUP_DOCUMENT
+from specimap_core.cloud import Cloud
+from specimap_core.cloud.labels import GROUP_DOCUMENT
 
 ARROW, NPY = "application/vnd.apache.arrow.stream", "application/x-npy"
 CLASSES: list[dict[str, Any]] = [

@@ -10,8 +10,8 @@ from typing import cast
 import pytest
 from fastapi import Request
 
-from specimap.infra.errors import RequestInvalidError
-from specimap.service.multipart import BATCH, FormFiles
+from specimap_service.errors import RequestInvalidError
+from specimap_service.uploads.multipart import BATCH, FormFiles
 
 BOUNDARY = "b0undary"
 

@@ -9,16 +9,16 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-from cloud_scene import FakeCube, counts, scene
 from numpy.typing import NDArray
 from PIL import Image
+
+from cloud_scene import FakeCube, counts, scene
 from result_scene import Result, put_result
 from service_scene import Running
-
-from specimap.core.cloud import Cloud
-from specimap.service import pictures
-from specimap.service.picture_cache import PictureCache
-from specimap.service.pictures import Picture
+from specimap_core.cloud import Cloud
+from specimap_service.clouds import pictures
+from specimap_service.clouds.picture_cache import PictureCache
+from specimap_service.clouds.pictures import Picture
 
 
 @pytest.fixture

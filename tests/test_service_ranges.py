@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from result_scene import Result, put_result
 from service_scene import Running, serving
-
-from specimap.service import ranges
+from specimap_service import byte_ranges
 
 SHARD = "spectra/c/0/0"
 LARGE = "spectra/c/9/0"
@@ -41,7 +41,7 @@ def reader(service: Running, result: Result) -> httpx.Client:
 @pytest.fixture(scope="module")
 def large(service: Running, result: Result) -> bytes:
     """A file of many pieces, as large shards are."""
-    content = np.random.default_rng(0).bytes(24 * ranges.PIECE + 12345)
+    content = np.random.default_rng(0).bytes(24 * byte_ranges.PIECE + 12345)
     service.storage.put(f"{result.prefix}/cloud.zarr/{LARGE}", content)
     return content
 
@@ -139,13 +139,13 @@ def test_a_file_deleted_while_it_is_sent_arrives_whole(service: Running, result:
 def test_reading_stops_when_the_client_goes(
     service: Running, result: Result, large: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    read, pieces = ranges._InFolder.read, []
+    read, pieces = byte_ranges._InFolder.read, []
 
-    def counted(self: ranges._InFolder, start: int, stop: int) -> bytes:
+    def counted(self: byte_ranges._InFolder, start: int, stop: int) -> bytes:
         pieces.append(start)
         return read(self, start, stop)
 
-    monkeypatch.setattr(ranges._InFolder, "read", counted)
+    monkeypatch.setattr(byte_ranges._InFolder, "read", counted)
     admin = service.client()
     line = 'handle_seconds_count{method="GET",route="/v1/clouds/{cloud_id}/zarr/{key:path}",status="200"}'
 
@@ -162,4 +162,4 @@ def test_reading_stops_when_the_client_goes(
     deadline = time.monotonic() + 20
     while finished() == before:
         assert time.monotonic() < deadline
-    assert 0 < len(pieces) < 20 < len(large) / ranges.PIECE
+    assert 0 < len(pieces) < 20 < len(large) / byte_ranges.PIECE

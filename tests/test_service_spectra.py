@@ -11,10 +11,10 @@ import httpx
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from spectra_scene import BANDS, COLS, ROWS, large_cloud, read, table_of
 
-from specimap.core.cloud import Cloud
-from specimap.service.answers import ARROW, BATCH, JSON, NPY
+from specimap_core.cloud import Cloud
+from specimap_service.array_responses import ARROW, BATCH, JSON, NPY
+from spectra_scene import BANDS, COLS, ROWS, large_cloud, read, table_of
 
 
 @pytest.fixture(scope="module")

@@ -15,9 +15,13 @@ import pytest
 import sqlalchemy as sa
 import structlog
 import tifffile
-from cube_files import random_values
 from scipy import io as scipy_io
+
+from cube_files import random_values
 from service_scene import Running, serving
+from specimap_infra.database import utc_now
+from specimap_infra.tables import Upload
+from specimap_service.uploads import lifecycle
 from upload_scene import (
     SAMPLES,
     TUS,
@@ -30,10 +34,6 @@ from upload_scene import (
     photos,
     result,
 )
-
-from specimap.infra.database import utc_now
-from specimap.infra.models import Upload
-from specimap.service import uploads
 
 PHOTO = photos()[0].read_bytes()
 
@@ -192,7 +192,7 @@ def test_expired_uploads_are_swept(tmp_path: Path) -> None:
         assert client.head(asked, headers=TUS).status_code == 410
         (folder / "up_stray").write_bytes(b"young")
         files = service.app.state.upload_files
-        both = [threading.Thread(target=uploads.sweep, args=(service.app.state.context, files)) for _ in range(2)]
+        both = [threading.Thread(target=lifecycle.sweep, args=(service.app.state.context, files)) for _ in range(2)]
         for thread in both:
             thread.start()
         for thread in both:

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from service_scene import Running
 from tusclient.client import TusClient
+
+from service_scene import Running
 from upload_scene import SAMPLES, BreakingProxy, new_acquisition, photos, result
 
 JS_CLIENT = Path(__file__).parent / "tus_client"

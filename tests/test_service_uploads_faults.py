@@ -14,7 +14,11 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
+
 from service_scene import Running
+from specimap_infra.database import utc_now
+from specimap_infra.tables import Upload
+from specimap_service.uploads import lifecycle, tus_store
 from upload_scene import (
     OCTETS,
     TUS,
@@ -29,10 +33,6 @@ from upload_scene import (
     process_serving,
     result,
 )
-
-from specimap.infra.database import utc_now
-from specimap.infra.models import Upload
-from specimap.service import tus_store, uploads
 
 PHOTO = photos()[0].read_bytes()
 
@@ -127,7 +127,7 @@ def test_a_process_that_died_after_the_last_byte(service: Running, ask: str) -> 
     elif ask == "sweep":
         with service.database.session() as session:
             session.get_one(Upload, upload_id).expires_at = utc_now()
-        uploads.sweep(service.app.state.context, service.app.state.upload_files)
+        lifecycle.sweep(service.app.state.context, service.app.state.upload_files)
     told = result(client, at)
     assert (told["state"], told["file"]["sha256"]) == ("finished", hashlib.sha256(PHOTO).hexdigest())
     (file,) = client.get(f"/v1/acquisitions/{acquisition}/files").json()

@@ -13,11 +13,11 @@ import tensorstore
 import xarray
 import zarr
 from obstore.store import HTTPStore
-from result_scene import Result, put_label, put_result
-from service_scene import Running, serving
 from zarr.storage import ObjectStore
 
-from specimap.core.cloud import ARRAYS
+from result_scene import Result, put_label, put_result
+from service_scene import Running, serving
+from specimap_core.cloud import ARRAYS
 
 SHARD = "spectra/c/0/0"
 

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from specimap.core.errors import SettingsError
-from specimap.core.reconstruct.learned.environment import BACKEND_VARIABLES
-from specimap.infra.settings import OTHER_VARIABLES, ServiceSettings, known_variables, load_settings
-from specimap.infra.settings_table import backends_table, page_part, settings_table
+from specimap_core.errors import SettingsError
+from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES
+from specimap_infra.settings import OTHER_VARIABLES, ServiceSettings, known_variables, load_settings
+from specimap_infra.settings_table import backends_table, page_part, settings_table
 
 ROOT = Path(__file__).parents[1]
 
@@ -166,11 +166,11 @@ def test_a_file_that_is_no_toml_or_not_there_is_refused(tmp_path: Path, monkeypa
 
 def test_the_page_holds_the_tables_as_the_module_prints_them() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "specimap.infra.settings_table"], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-m", "specimap_infra.settings_table"], capture_output=True, text=True, check=True, timeout=60
     )
     assert done.stdout == page_part() + "\n"
     page = (ROOT / "docs" / "settings.md").read_text("utf-8")
-    assert done.stdout in page, "print it anew: python -m specimap.infra.settings_table"
+    assert done.stdout in page, "print it anew: python -m specimap_infra.settings_table"
 
 
 def test_the_table_lists_every_setting_once_with_its_meaning() -> None:

@@ -8,25 +8,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scenes import Finished, OnDisk, bump_mesh, phantom_on_disk
-from test_motion import CORNERS, LARGER, TOLERANCE_MM, VIEW, moved_by, seen, stage2_of, textured, turned
 
-from specimap.core.accuracy import CornersInCube
-from specimap.core.cloud import Cloud, Flag
-from specimap.core.cube import open_cube
-from specimap.core.evidence.truth import judge, judge_with_sigma
-from specimap.core.geometry import fit_similarity
-from specimap.core.phantom import Phantom, PhantomSettings, load_truth, write_cube
-from specimap.core.phantom.render import CLASS_CARD, CLASS_SPECIMEN
-from specimap.core.phantom.truth import save_truth
-from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline
-from specimap.core.pipeline.finish import corners_in_cube
-from specimap.core.raycast import RayCaster
-from specimap.core.register.camera import CubeCamera, solve_camera
-from specimap.core.register.cube_markers import CubeMarkers, find_markers
-from specimap.core.register.motion import SHARED_MM
-from specimap.core.register.settle import LOOSE_MM, Settled, settle_camera
-from specimap.core.report import Report
+from scenes import Finished, OnDisk, bump_mesh, phantom_on_disk
+from specimap_core.cloud import Cloud, Flag
+from specimap_core.cube import open_cube
+from specimap_core.geometry.cameras import fit_similarity
+from specimap_core.pipeline.outputs import Inputs
+from specimap_core.pipeline.register_stage import corners_in_cube
+from specimap_core.pipeline.run import run_pipeline
+from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.register.accuracy import CornersInCube
+from specimap_core.register.camera_refinement import LOOSE_MM, Settled, settle_camera
+from specimap_core.register.cube_camera import CubeCamera, solve_camera
+from specimap_core.register.cube_markers import CubeMarkers, find_markers
+from specimap_core.register.specimen_motion import SHARED_MM
+from specimap_core.report.model import Report
+from specimap_core.surface.raycast import RayCaster
+from specimap_core.truth.judge import judge, judge_with_sigma
+from specimap_core.truth.truth_file import save_truth
+from specimap_validation.phantom import Phantom, PhantomSettings, load_truth, write_cube
+from specimap_validation.phantom.render import CLASS_CARD, CLASS_SPECIMEN
+from test_motion import CORNERS, LARGER, TOLERANCE_MM, VIEW, moved_by, seen, stage2_of, textured, turned
 
 ROWS, COLS = VIEW.intrinsics.height, VIEW.intrinsics.width
 SHARP_PX, BLURRED_PX = 0.02, 0.5

@@ -14,20 +14,20 @@ from pathlib import Path
 import pytest
 import typer
 from PIL import Image
-from scenes import OnDisk
 from typer.testing import CliRunner
 
-from specimap.cli.evidence import study_app
-from specimap.core.errors import CancelledError, CubeNotFoundError, OutputExistsError, SettingsError
-from specimap.core.evidence import subsampling
-from specimap.core.evidence.capture import find_capture
-from specimap.core.evidence.pages import publish_study
-from specimap.core.evidence.runs import AgainstTruth, Figures, Outcome, Refusal
-from specimap.core.evidence.subsampling import FILE, Row, Study, plan, study_subsampling
-from specimap.core.evidence.tables import STUDY_HEADINGS, study_table
-from specimap.core.pipeline import PipelineSettings
-from specimap.core.plotting import PRINT_DPI, WIDTH_IN
-from specimap.core.report import Quartiles, Spread
+from scenes import OnDisk
+from specimap_cli.validation import study_app
+from specimap_core.errors import CancelledError, CubeNotFoundError, OutputExistsError, SettingsError
+from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.report.model import Quartiles, Spread
+from specimap_core.report.plotting import PRINT_DPI, WIDTH_IN
+from specimap_validation import subsampling
+from specimap_validation.capture import find_capture
+from specimap_validation.pages import publish_study
+from specimap_validation.runs import AgainstTruth, Figures, Outcome, Refusal
+from specimap_validation.subsampling import FILE, Row, Study, plan, study_subsampling
+from specimap_validation.tables import STUDY_HEADINGS, study_table
 
 SETTINGS = PipelineSettings()
 
@@ -109,7 +109,7 @@ def test_a_real_study_has_rows_and_refusals(small: OnDisk, tmp_path: Path) -> No
 
 
 PROGRAM = (
-    "import typer; from specimap.cli.evidence import study_app; "
+    "import typer; from specimap_cli.validation import study_app; "
     "app = typer.Typer(); app.add_typer(study_app, name='study'); app()"
 )
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from feature_scene import photo_of
 
-from specimap.core.phantom import Phantom, PhantomSettings
-from specimap.core.reconstruct.texture import between_markers, textured_share, usual_share
+from feature_scene import photo_of
+from specimap_core.photos.texture import between_markers, textured_share, usual_share
+from specimap_validation.phantom import Phantom, PhantomSettings
 
 
 def scene(texture_contrast: float, gloss: float = 0.15) -> Phantom:

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from test_fiducials import LAYOUT, picture
 
-from specimap.core.fiducials import Detection, detect_markers, dictionary_named, measured_at, tone_of
-from specimap.core.tone import LEAST_CELLS, RANGE, cell_borders, tone_between
+from specimap_core.fiducials.detection import Detection, detect_markers, dictionary_named, measured_at, tone_of
+from specimap_core.fiducials.tone import LEAST_CELLS, RANGE, cell_borders, tone_between
+from test_fiducials import LAYOUT, picture
 
 FACTOR = 2.5
 LARGE = {k: FACTOR * (corners + 0.5) - 0.5 for k, corners in LAYOUT.items()}

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from matched_scene import matched
 from numpy.typing import NDArray
 
-from specimap.core.refine import Refined, RefineSettings, refine_mesh
-from specimap.core.surface import Mesh
-from specimap.core.uncertainty import (
+from matched_scene import matched
+from specimap_core.surface.fusion import Mesh
+from specimap_core.surface.refinement import Refined, RefineSettings, refine_mesh
+from specimap_core.surface.uncertainty import (
     AGREEMENT_MM,
     LEAST_SIGMA_MM,
     LEAST_SUPPORT,

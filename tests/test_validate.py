@@ -9,20 +9,20 @@ from pathlib import Path
 
 import pytest
 import typer
-from scenes import OnDisk
-from test_study import REFUSED, outcome
 from typer.testing import CliRunner
 
-from specimap.cli import evidence
-from specimap.core.errors import CancelledError, NotFoundError, OutputExistsError, SettingsError, StorageFullError
-from specimap.core.evidence import cases as cases_module
-from specimap.core.evidence import validation as v
-from specimap.core.evidence.cases import DEFECTS, MOVED, QUICK, QUICK_DEFECTS, Case, cases
-from specimap.core.evidence.pages import markdown, publish_validation
-from specimap.core.evidence.runs import Outcome
-from specimap.core.evidence.tables import VALIDATION_HEADINGS, validation_tables
-from specimap.core.evidence.validation import AS_PUBLISHED, FILE, OURS, VARIANTS, Row, Validation, validate
-from specimap.core.phantom import PhantomSettings
+from scenes import OnDisk
+from specimap_cli import validation as evidence
+from specimap_core.errors import CancelledError, NotFoundError, OutputExistsError, SettingsError, StorageFullError
+from specimap_validation import cases as cases_module
+from specimap_validation import validation as v
+from specimap_validation.cases import DEFECTS, MOVED, QUICK, QUICK_DEFECTS, Case, cases
+from specimap_validation.pages import markdown, publish_validation
+from specimap_validation.phantom import PhantomSettings
+from specimap_validation.runs import Outcome
+from specimap_validation.tables import VALIDATION_HEADINGS, validation_tables
+from specimap_validation.validation import AS_PUBLISHED, FILE, OURS, VARIANTS, Row, Validation, validate
+from test_study import REFUSED, outcome
 
 TINY = replace(QUICK, photos=10, photo_size=384, cube_rows=160, cube_cols=200, mesh_divisions=64)
 NOTHING = PhantomSettings(photos=1, photo_size=32, cube_rows=16, cube_cols=16, bands=2, mesh_divisions=4)

@@ -7,14 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from cube_files import Values, write_envi
 from scenes import Finished, OnDisk, xyz_image
+from specimap_core.cloud import Cloud, Flag
+from specimap_core.geometry.cameras import Array
+from specimap_core.pipeline.outputs import Inputs
+from specimap_core.pipeline.run import run_pipeline
+from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.report.model import Report
 from value_files import listed
-
-from specimap.core.cloud import Cloud, Flag
-from specimap.core.geometry import Array
-from specimap.core.pipeline import Inputs, PipelineSettings, run_pipeline
-from specimap.core.report import Report
 
 BORDER = 25
 

@@ -17,15 +17,15 @@ from typing import Any
 import httpx
 import pytest
 import sqlalchemy as sa
+
 from job_scene import EXECUTOR, acquisition, queued_job
 from service_scene import serving
-
-from specimap.core.errors import SettingsError
-from specimap.infra import jobs, webhooks
-from specimap.infra.database import Database, utc_now
-from specimap.infra.models import Delivery
-from specimap.infra.settings import ServiceSettings, load_settings
-from specimap.infra.webhooks import check_target, deliver_due, webhook_client
+from specimap_core.errors import SettingsError
+from specimap_infra import jobs, webhooks
+from specimap_infra.database import Database, utc_now
+from specimap_infra.settings import ServiceSettings, load_settings
+from specimap_infra.tables import Delivery
+from specimap_infra.webhooks import check_target, deliver_due, webhook_client
 
 SECRET = "0123456789abcdef-ü"
 

@@ -15,9 +15,8 @@ from pathlib import Path
 
 from scenes import Finished, OnDisk
 from specimap_client import Client, Retries
+from specimap_service.auth.keys import new_key
 from worker_scene import QUICK, Shop, assert_all_succeed, shop
-
-from specimap.service.auth import new_key
 
 JOBS = 200
 KILLS = 6
@@ -27,7 +26,7 @@ KILLS = 6
 def api(yard: Shop, port: int) -> Iterator[Callable[[], None]]:
     """An API process on a port; gives what kills it and starts it again."""
     environment = {**os.environ, **yard.environment, "SPECIMAP_PORT": str(port)}
-    command = [sys.executable, "-c", "from specimap.cli import main; main()", "serve", "--no-worker"]
+    command = [sys.executable, "-c", "from specimap_cli import main; main()", "serve", "--no-worker"]
     processes: list[subprocess.Popen[bytes]] = []
 
     def start() -> None:

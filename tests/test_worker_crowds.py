@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
+
 from databases import postgres_url
 from gate import Gate
 from object_store import object_store
 from scenes import Finished, OnDisk
 from service_scene import serving
+from specimap_core.cloud import Cloud
 from worker_scene import QUICK, assert_all_succeed, shop, until
-
-from specimap.core.cloud import Cloud
 
 JOBS = 60
 KILLS = 6

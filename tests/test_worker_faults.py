@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import Finished, OnDisk
-from worker_scene import Shop, processes_of, shop, until
 
-from specimap.core.cloud import Cloud
-from specimap.core.pipeline.clock import STAGES
-from specimap.workers.processes import SPARES
+from scenes import Finished, OnDisk
+from specimap_core.cloud import Cloud
+from specimap_core.pipeline.clock import STAGES
+from specimap_workers.stage_process import SPARES
+from worker_scene import Shop, processes_of, shop, until
 
 TAKEOVER_SECONDS = 20.0
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap.core.geometry import View
-from specimap.core.phantom import Scene
+from specimap_core.geometry.cameras import View
+from specimap_validation.phantom import Scene
 
 
 def true_depth(scene: Scene, view: View) -> NDArray[np.float32]:

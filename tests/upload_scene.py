@@ -17,10 +17,10 @@ from typing import Any
 
 import httpx
 
-from specimap.infra.database import Database
-from specimap.infra.migrate import migrate
-from specimap.infra.settings import load_settings
-from specimap.service.auth import new_key
+from specimap_infra.database import Database
+from specimap_infra.migrate import migrate
+from specimap_infra.settings import load_settings
+from specimap_service.auth.keys import new_key
 
 SAMPLES = Path(__file__).parents[1] / "samples"
 TUS = {"Tus-Resumable": "1.0.0"}
@@ -29,9 +29,9 @@ OCTETS = "application/offset+octet-stream"
 SERVER = """
 import json, resource, socket, sys
 import uvicorn
-from specimap.infra.logs import set_up_logs
-from specimap.infra.settings import load_settings
-from specimap.service.app import create_app
+from specimap_infra.logs import set_up_logs
+from specimap_infra.settings import load_settings
+from specimap_service.app import create_app
 
 given = json.loads(sys.argv[1])
 limit = given.pop("largest_file", 0)

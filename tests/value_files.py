@@ -10,9 +10,9 @@ import h5py
 import numpy as np
 import scipy.io
 import tifffile
-from cube_files import Values, write_envi
 
-from specimap.core.geometry import Floats
+from cube_files import Values, write_envi
+from specimap_core.geometry.cameras import Floats
 
 NM = np.linspace(400.0, 900.0, 6)
 

@@ -18,14 +18,14 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from specimap.infra import jobs
-from specimap.infra.database import Database
-from specimap.infra.ids import new_id
-from specimap.infra.migrate import migrate
-from specimap.infra.models import FINAL_STATES, Acquisition, CloudRow, Job, JobEvent, Lease, StoredFile
-from specimap.infra.queue import JOBS, RUN_JOB, enqueue, queue_client
-from specimap.infra.settings import ServiceSettings, load_settings
-from specimap.infra.storage import Storage
+from specimap_infra import jobs
+from specimap_infra.database import Database
+from specimap_infra.ids import new_id
+from specimap_infra.migrate import migrate
+from specimap_infra.queue import JOBS, RUN_JOB, enqueue, queue_client
+from specimap_infra.settings import ServiceSettings, load_settings
+from specimap_infra.storage import Storage
+from specimap_infra.tables import FINAL_STATES, Acquisition, CloudRow, Job, JobEvent, Lease, StoredFile
 
 HERE = Path(__file__).parent
 HELD = f"{sys.executable} {HERE / 'held_stage.py'}"
@@ -150,7 +150,7 @@ class Shop:
         """Start a worker process; it is ready when its lease is there."""
         known = self.leases()
         worker = subprocess.Popen(
-            [sys.executable, "-m", "specimap.workers", "--stage-command", command],
+            [sys.executable, "-m", "specimap_workers", "--stage-command", command],
             env={**os.environ, **self.environment, "HOLD_FOLDER": str(self.hold), **options},
             start_new_session=True,
         )

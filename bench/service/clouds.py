@@ -21,7 +21,7 @@ from bench.service.peer import NO_NGINX, nginx, nginx_version
 from bench.service.scene import Result, folder_bytes, put_result
 from bench.service.serving import Served, serving
 from bench.service.sheet import NONE, Sheet
-from specimap.core.cloud.schema import ARRAYS
+from specimap_core.cloud.schema import ARRAYS
 
 Arrays = dict[str, NDArray[Any]]
 Reader = Callable[[], Arrays]

@@ -7,12 +7,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from specimap_client import Client, Job
-
 from bench.sample import SAMPLE
 from bench.service.options import Options
 from bench.service.serving import serving
 from bench.service.sheet import Sheet, reached
+from specimap_client import Client, Job
 
 OVERHEAD_TARGET_S = 2.0
 FIRST_R_PC = 0.6

@@ -11,13 +11,13 @@ import numpy as np
 from bench.sample import SAMPLE
 from bench.service.serving import Served
 from bench.synthetic import BANDS, COLS, ROWS, enlarge, write_envi_cube
-from specimap.core.cloud import Cloud, CloudPoints
-from specimap.core.cloud.writer import write_cloud
-from specimap.core.cube import open_cube
-from specimap.infra.database import Database, utc_now
-from specimap.infra.ids import new_id
-from specimap.infra.models import Acquisition, CloudRow, Job
-from specimap.infra.storage import Storage
+from specimap_core.cloud import Cloud, CloudPoints
+from specimap_core.cloud.writer import write_cloud
+from specimap_core.cube import open_cube
+from specimap_infra.database import Database, utc_now
+from specimap_infra.ids import new_id
+from specimap_infra.storage import Storage
+from specimap_infra.tables import Acquisition, CloudRow, Job
 
 CUBE_ROWS = 400
 POINTS_ACROSS = 750

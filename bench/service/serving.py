@@ -13,12 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from specimap_client import Client
-
-from specimap.infra.settings import ServiceSettings, load_settings
+from specimap_infra.settings import ServiceSettings, load_settings
 
 START_SECONDS = 60
 TICKS = os.sysconf("SC_CLK_TCK")
-COMMAND = (sys.executable, "-c", "from specimap.cli import main; main()", "serve")
+COMMAND = (sys.executable, "-c", "from specimap_cli import main; main()", "serve")
 
 
 @dataclass(frozen=True)

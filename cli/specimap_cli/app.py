@@ -1,0 +1,244 @@
+"""``specimap run``, ``info``, ``export``: what a person, or another program by ``--json``, types."""
+
+from __future__ import annotations
+
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from specimap_cli.doctor import doctor
+from specimap_cli.errors import Debug, stoppable, told
+from specimap_cli.keys import keys_app
+from specimap_cli.progress import Listener, json_listener, progress_listener
+from specimap_cli.report import report
+from specimap_cli.validation import study_app, validate
+from specimap_core import __version__
+from specimap_core.json_text import json_text
+from specimap_core.photos.formats import NAMES
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Photos and one hyperspectral cube of an excised specimen to a metric 3D point cloud with spectra.",
+)
+
+
+class Method(StrEnum):
+    """Registration methods."""
+
+    camera = "camera"
+    homography = "homography"
+
+
+class Adjustment(StrEnum):
+    """Forms of the joint adjustment."""
+
+    rigid = "rigid"
+    free = "free"
+
+
+class Backend(StrEnum):
+    """Reconstruction backends."""
+
+    colmap = "colmap"
+    mast3r = "mast3r"
+    da3 = "da3"
+
+
+class Features(StrEnum):
+    """Features that locate photos which the markers leave open."""
+
+    auto = "auto"
+    sift = "sift"
+    aliked = "aliked"
+
+
+class Format(StrEnum):
+    """Export formats."""
+
+    ply = "ply"
+    las = "las"
+    npz = "npz"
+    envi = "envi"
+    csv = "csv"
+    html = "html"
+    pdf = "pdf"
+
+
+class Kind(StrEnum):
+    """What a worker's slot is."""
+
+    cpu = "cpu"
+    gpu = "gpu"
+
+
+@app.command()
+def run(
+    photos: Annotated[Path, typer.Option(help=f"Folder of the photos: {NAMES}.")],
+    cube: Annotated[
+        Path,
+        typer.Option(
+            help="The cube: an ENVI header, .npy, .npz, HDF5, NetCDF, MATLAB or TIFF; FILE::DATASET for one of several."
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the results; an earlier run's is continued.")],
+    white: Annotated[Path | None, typer.Option(help="White reference of the cube, for reflectance.")] = None,
+    dark: Annotated[Path | None, typer.Option(help="Dark reference of the cube.")] = None,
+    edge_mm: Annotated[float, typer.Option(help="Edge of a marker's black square, mm.")] = 6.8,
+    dictionary: Annotated[str, typer.Option(help="The markers' ArUco dictionary.")] = "DICT_4X4_50",
+    method: Annotated[Method, typer.Option(help="camera removes parallax; homography is the published one.")] = (
+        Method.camera
+    ),
+    adjustment: Annotated[Adjustment, typer.Option(help="rigid squares, or free corners as published.")] = (
+        Adjustment.rigid
+    ),
+    r_pc: Annotated[float, typer.Option(help="Cell of the fine grid, mm.")] = 0.5,
+    r_reg: Annotated[float, typer.Option(help="Cell of the coarse grid, mm.")] = 2.0,
+    backend: Annotated[Backend, typer.Option(help="Reconstruction backend; docs/backends.md.")] = Backend.colmap,
+    features: Annotated[
+        Features, typer.Option(help="Features that locate photos which the markers leave open.")
+    ] = Features.auto,
+    working_px: Annotated[int, typer.Option(help="Longer side that larger photos are brought to.")] = 1280,
+    json_events: Annotated[bool, typer.Option("--json", help="One JSON line per event instead of a bar.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Reconstruct, adjust, render, register; write cloud.zarr, mesh.ply, report.json, corners.json, preview.png."""
+    listener: Listener = json_listener() if json_events else progress_listener()
+    with told(listener, debug), stoppable() as stop_asked:
+        # Imported late: `specimap --help` and `specimap info` need none of the 3D libraries.
+        from specimap_core.pipeline.outputs import Inputs, Outputs
+        from specimap_core.pipeline.run import run_pipeline
+        from specimap_core.pipeline.settings import settings_from
+
+        settings = settings_from(
+            edge_mm=edge_mm,
+            dictionary=dictionary,
+            method=method.value,
+            adjustment=adjustment.value,
+            r_pc=r_pc,
+            r_reg=r_reg,
+            backend=backend.value,
+            features=features.value,
+            working_px=working_px,
+        )
+        with listener:
+            report = run_pipeline(
+                Inputs(photos, cube, white, dark),
+                out,
+                settings,
+                progress=listener.progress,
+                cancelled=stop_asked,
+            )
+        listener.finished(report, Outputs(out))
+
+
+@app.command()
+def info(
+    out: Annotated[Path, typer.Argument(help="Folder of a run.")],
+    json_events: Annotated[bool, typer.Option("--json", help="Print report.json as it is.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Print the report of a run."""
+    with told(json_listener() if json_events else progress_listener(), debug):
+        from specimap_cli.tables import print_report
+        from specimap_core.report.model import read_report
+
+        report = read_report(out)
+        if json_events:
+            sys.stdout.write(report.text() + "\n")
+        else:
+            print_report(report)
+
+
+@app.command()
+def export(
+    out: Annotated[Path, typer.Argument(help="Folder of a run.")],
+    format: Annotated[Format, typer.Option(help="What to write.")],
+    target: Annotated[Path | None, typer.Option(help="Where to; by default beside the cloud.")] = None,
+    json_events: Annotated[bool, typer.Option("--json", help="Answer in one JSON line.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Write the cloud in another format."""
+    with told(json_listener() if json_events else progress_listener(), debug):
+        from specimap_core.cloud import Cloud
+        from specimap_core.export import export_cloud
+
+        cloud = Cloud.open(out / "cloud.zarr")
+        suffix = "hdr" if format is Format.envi else format.value
+        stem = "report" if format in (Format.html, Format.pdf) else "cloud"
+        written = export_cloud(cloud, target or out / f"{stem}.{suffix}", format.value)
+        if json_events:
+            sys.stdout.write(json_text({"event": "exported", "path": str(written)}) + "\n")
+        else:
+            typer.echo(f"Wrote {written}")
+
+
+@app.command()
+def serve(
+    worker: Annotated[bool, typer.Option(help="Run workers too; without, `specimap worker` runs them.")] = True,
+    debug: Debug = False,
+) -> None:
+    """Start the service: API and workers. Settings come from SPECIMAP_ variables; docs/settings.md lists them."""
+    with told(progress_listener(), debug):
+        from specimap_cli.serve import serve as run_service
+
+        run_service(workers=worker, say=typer.echo)
+
+
+@app.command()
+def worker(
+    slots: Annotated[int | None, typer.Option(min=1, max=64, help="Jobs side by side.")] = None,
+    kind: Annotated[Kind, typer.Option(help="What the slots are.")] = Kind.cpu,
+    debug: Debug = False,
+) -> None:
+    """Start workers for a service that runs elsewhere, on the same database and storage."""
+    with told(progress_listener(), debug):
+        from specimap_cli.serve import work
+
+        work(slots=slots, kind=kind.value)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the results and the demo's service.")] = Path("out/demo"),
+    samples: Annotated[Path, typer.Option(help="Folder of the sample that comes with the source.")] = Path("samples"),
+    stay: Annotated[
+        bool | None, typer.Option(help="Let the service go on until Ctrl-C; by default on a terminal.")
+    ] = None,
+    debug: Debug = False,
+) -> None:
+    """Run the sample through a service of its own: upload, job, progress, report, link."""
+    listener = progress_listener()
+    with told(listener, debug):
+        from specimap_cli.demo import demo as run_demo
+
+        run_demo(samples, out, listener, stay=sys.stdout.isatty() if stay is None else stay, say=typer.echo)
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"specimap {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True)] = False,
+) -> None:
+    """Photos and one hyperspectral cube of an excised specimen to a metric 3D point cloud with spectra."""
+
+
+app.command()(report)
+app.command()(validate)
+app.command()(doctor)
+app.add_typer(study_app, name="study")
+app.add_typer(keys_app, name="keys")
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    app()

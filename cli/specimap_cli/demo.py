@@ -1,0 +1,154 @@
+"""``specimap demo``: the sample through a service of its own: upload, job, progress, report, link."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from specimap_cli.progress import Listener, UploadBar
+from specimap_core.atomic import atomic_path, remove
+from specimap_core.errors import BackendUnavailableError, NotFoundError, SpecimapError
+from specimap_core.report.model import Report
+
+if TYPE_CHECKING:
+    from specimap_client import Client
+
+START_SECONDS = 60.0
+LISTENS = "Specimap listens on "
+KEY = "spk_"
+
+
+def demo(samples: Path, out: Path, listener: Listener, *, stay: bool, say: Callable[[str], None]) -> None:
+    """Start a service on ``out / "service"``, run the sample through it, leave the results in ``out``.
+
+    Raises:
+        NotFoundError: there is no sample.
+        BackendUnavailableError: the client is not installed, or the service does not start.
+        SpecimapError: its leaves, as the service answers them.
+    """
+    try:
+        from specimap_client import ApiError, Client, JobFailed
+    except ImportError as error:
+        raise BackendUnavailableError(
+            "The demo needs the package specimap-client.", advice="Install it: pip install ./client"
+        ) from error
+    photos, cube = sorted((samples / "rgb").glob("*.jpg")), samples / "hsi" / "hsi.hdr"
+    if not photos or not cube.is_file():
+        raise NotFoundError(f"{samples} holds no sample.", advice="Name the folder samples/ of the source.")
+    with _service(out / "service") as (url, key):
+        say(f"A service of its own listens on {url}")
+        try:
+            with Client(url, key) as client:
+                _run(client, photos, cube, out, listener, say)
+        except JobFailed as failed:
+            why = failed.job.error
+            raise _again(failed.code, why.message if why else str(failed), why.advice if why else "") from failed
+        except ApiError as refused:
+            raise _again(refused.code, refused.message, refused.advice) from refused
+        if stay:
+            say(f"The service goes on: the API is described at {url}/docs, the demo's key is {key}")
+            say("Ctrl-C ends it.")
+            threading.Event().wait()
+    say(f"To serve these results again: export SPECIMAP_DATA_DIR={out / 'service'}; specimap serve")
+    say("A key for it: specimap keys create --name me --scope admin")
+
+
+def _run(
+    client: Client, photos: list[Path], cube: Path, out: Path, listener: Listener, say: Callable[[str], None]
+) -> None:
+    acquisition = client.acquisitions.create("SAMPLE-A", notes="The sample that comes with Specimap.")
+    with UploadBar() as bar:
+        files = client.acquisitions.upload(
+            acquisition, photos=photos, cube=cube, progress=lambda p: bar.update(p.total_sent, p.total_size)
+        )
+    accepted = sum(f.state == "accepted" for f in files)
+    say(f"{accepted} of {len(files)} files accepted; each was judged as it arrived.")
+    with listener:
+        job = client.jobs.wait(
+            client.jobs.submit(acquisition, priority="intraoperative"),
+            progress=lambda job: listener.progress(job.stage, job.progress) if job.stage else None,
+        )
+    assert job.cloud_id is not None
+    cloud = client.clouds.get(job.cloud_id)
+    report = Report.model_validate(client.jobs.report(job).raw)
+    listener.report(report)
+    out.mkdir(parents=True, exist_ok=True)
+    text = report.model_dump_json(indent=1).encode()
+    for name, data in (("report.json", text), ("preview.png", cloud.preview("pca"))):
+        with atomic_path(out / name) as aside:
+            aside.write_bytes(data)
+    cloud.export("mesh-ply", out / "mesh.ply")
+    remove(out / "cloud.zarr")
+    cloud.download(out / "cloud.zarr")
+    for name in ("cloud.zarr", "mesh.ply", "preview.png", "report.json"):
+        say(f"{name:<12} {out / name}")
+    say(f"{'link':<12} {client.url}/v1/clouds/{cloud.id}")
+
+
+def _again(code: str, message: str, advice: str) -> SpecimapError:
+    """The service's error as one of ours, with its code."""
+    leaf = type("ServiceError", (SpecimapError,), {"code": code})
+    error = leaf(message, advice=advice)
+    assert isinstance(error, SpecimapError)
+    return error
+
+
+@contextmanager
+def _service(folder: Path) -> Iterator[tuple[str, str]]:
+    """A service on a folder and a free port: its address and a new administrator's key."""
+    remove(folder)
+    folder.mkdir(parents=True, mode=0o700)
+    environment = {
+        **{name: value for name, value in os.environ.items() if not name.startswith("SPECIMAP_")},
+        "SPECIMAP_DATA_DIR": str(folder.absolute()),
+        "SPECIMAP_PORT": "0",
+        "SPECIMAP_MIN_FREE_BYTES": "0",
+        "PYTHONUNBUFFERED": "1",
+    }
+    log = open(folder / "service.log", "wb")  # noqa: SIM115 - outlives this block's first lines
+    process = subprocess.Popen(
+        [sys.executable, "-c", "from specimap_cli import main; main()", "serve"],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=log,
+        text=True,
+    )
+    try:
+        yield _told(process, folder / "service.log")
+    finally:
+        process.terminate()
+        try:
+            process.wait(20)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        log.close()
+
+
+def _told(process: subprocess.Popen[str], log: Path) -> tuple[str, str]:
+    """Address and key, as the service prints them."""
+    found: dict[str, str] = {}
+    complete = threading.Event()
+
+    def read() -> None:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line.startswith(LISTENS):
+                found["url"] = line.removeprefix(LISTENS).strip()
+            if line.startswith(KEY):
+                found["key"] = line.strip()
+                complete.set()
+
+    threading.Thread(target=read, daemon=True).start()
+    deadline = time.monotonic() + START_SECONDS
+    while not complete.wait(0.1):
+        if process.poll() is not None or time.monotonic() > deadline:
+            raise BackendUnavailableError("The service did not start.", advice=f"{log} says why.", log=str(log))
+    return found["url"], found["key"]

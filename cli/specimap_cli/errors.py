@@ -1,0 +1,76 @@
+"""What every command shares: exit statuses, errors told by code and advice, stopping in order."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Annotated
+
+import typer
+
+from specimap_cli.progress import Listener
+from specimap_core.errors import CancelledError, MemoryExhaustedError, SpecimapError, StageFailedError
+
+REFUSED = 2
+"""Exit status of a refused input."""
+FAILED = 1
+"""Exit status where the program itself failed: an error that nobody foresaw."""
+STOPPED = 130
+DEBUG_VARIABLE = "SPECIMAP_DEBUG"
+
+Debug = Annotated[
+    bool, typer.Option("--debug", envvar=DEBUG_VARIABLE, help="Print the traceback of an unforeseen error.")
+]
+
+
+@contextmanager
+def stoppable() -> Iterator[Callable[[], bool]]:
+    """Let SIGINT and SIGTERM ask for a stop at the next step; asked twice, the program ends at once."""
+    asked: list[int] = []
+
+    def stop(number: int, _: object) -> None:
+        asked.append(number)
+        signal.signal(number, signal.SIG_DFL)
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(asked)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _status(error: SpecimapError) -> int:
+    if isinstance(error, CancelledError):
+        return STOPPED
+    return FAILED if isinstance(error, StageFailedError | MemoryExhaustedError) else REFUSED
+
+
+@contextmanager
+def told(listener: Listener, debug: bool) -> Iterator[None]:
+    """Tell of any error by its code and advice, never by a traceback, and exit accordingly."""
+    try:
+        yield
+    except SpecimapError as error:
+        if debug:
+            traceback.print_exc()
+        listener.refused(error)
+        raise typer.Exit(_status(error)) from None
+    except BrokenPipeError:
+        # Who reads the output has gone; Python would complain once more when it flushes at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise typer.Exit(FAILED) from None
+    except Exception as error:
+        if debug:
+            traceback.print_exc()
+        listener.refused(
+            SpecimapError(
+                f"An error that Specimap does not know: {type(error).__name__}: {error}",
+                advice=f"Repeat with {DEBUG_VARIABLE}=1 and report what it prints. Finished stages are kept.",
+            )
+        )
+        raise typer.Exit(FAILED) from None

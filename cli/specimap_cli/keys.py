@@ -1,0 +1,133 @@
+"""``specimap keys``: made, listed, revoked straight in the database, for whoever runs the service."""
+
+from __future__ import annotations
+
+import datetime
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from specimap_cli.errors import REFUSED
+from specimap_core.errors import NotFoundError, SettingsError, SpecimapError
+from specimap_core.json_text import json_text
+
+if TYPE_CHECKING:
+    from sqlalchemy.orm import Session
+
+AUDITED_AS = "cli"
+"""Stands for the key in the audit trail: whoever reaches the database needs none."""
+
+keys_app = typer.Typer(no_args_is_help=True, help="Keys to the API: create, list, revoke.")
+
+
+class Scope(StrEnum):
+    """What a key may do; admin may do everything."""
+
+    upload = "upload"
+    read = "read"
+    label = "label"
+    admin = "admin"
+
+
+@keys_app.command()
+def create(
+    name: Annotated[str, typer.Option(help="Whose key it is; no patient's name.")],
+    scope: Annotated[list[Scope], typer.Option(help="What it may do; give it again for more.")],
+    expires: Annotated[
+        datetime.datetime | None,
+        typer.Option(formats=["%Y-%m-%d", "%Y-%m-%dT%H:%M:%S"], help="From when on it is refused, UTC."),
+    ] = None,
+) -> None:
+    """Make a key and print it, alone on standard output. It is shown this once and kept nowhere."""
+    with _transaction() as session:
+        from specimap_infra.database import utc_now
+        from specimap_service.auth.keys import new_key
+        from specimap_service.context import audit
+
+        if not 1 <= len(name) <= 100:
+            raise SettingsError("A name has 1 to 100 characters.", advice="Give another --name.", setting="name")
+        until = None if expires is None else expires.replace(tzinfo=datetime.UTC)
+        if until is not None and until <= utc_now():
+            raise SettingsError(
+                f"{until.isoformat()} has passed.", advice="Give a later time to --expires.", setting="expires"
+            )
+        row, key = new_key(name, [s.value for s in scope], expires_at=until)
+        session.add(row)
+        audit(session, AUDITED_AS, "key.create", row.id, scopes=row.scopes)
+    typer.echo(f"Key {row.id} may: {', '.join(row.scopes)}. It is shown this once.", err=True)
+    typer.echo(key)
+
+
+@keys_app.command(name="list")
+def list_keys(as_json: Annotated[bool, typer.Option("--json", help="One JSON line a key.")] = False) -> None:
+    """List all keys, revoked ones too, without their secrets."""
+    with _transaction() as session:
+        import sqlalchemy as sa
+
+        from specimap_infra.database import utc_now
+        from specimap_infra.tables import ApiKey
+
+        rows, now = list(session.scalars(sa.select(ApiKey).order_by(ApiKey.id))), utc_now()
+    table = Table("id", "name", "scopes", "created", "last used", "state", box=None)
+    for row in rows:
+        ended = "revoked" if row.revoked_at else "expired" if row.expires_at and row.expires_at <= now else "valid"
+        if as_json:
+            times = {name: getattr(row, name) for name in ("created_at", "last_used_at", "expires_at", "revoked_at")}
+            told = {name: value.isoformat() if value else None for name, value in times.items()}
+            line = {"id": row.id, "name": row.name, "scopes": row.scopes, "state": ended, **told}
+            sys.stdout.write(json_text(line) + "\n")
+            continue
+        used = row.last_used_at.isoformat(" ", "minutes") if row.last_used_at else "never"
+        table.add_row(row.id, row.name, " ".join(row.scopes), row.created_at.isoformat(" ", "minutes"), used, ended)
+    if not as_json:
+        # A terminal is as wide as it is, but what goes elsewhere is not cut.
+        console = Console(markup=False)
+        console.print(table) if console.is_terminal else Console(width=300, markup=False).print(table)
+
+
+@keys_app.command()
+def revoke(key_id: Annotated[str, typer.Argument(help="Its id, key_…, as `specimap keys list` shows it.")]) -> None:
+    """Revoke a key; it is refused within two seconds everywhere."""
+    with _transaction() as session:
+        from specimap_infra.database import utc_now
+        from specimap_infra.tables import ApiKey
+        from specimap_service.context import audit
+
+        row = session.get(ApiKey, key_id)
+        if row is None:
+            raise NotFoundError(f"There is no key {key_id}.", advice="`specimap keys list` lists all.")
+        if row.revoked_at is None:
+            row.revoked_at = utc_now()
+            audit(session, AUDITED_AS, "key.revoke", key_id)
+    typer.echo(f"Revoked {key_id}.", err=True)
+
+
+@contextmanager
+def _transaction() -> Iterator[Session]:
+    """A transaction on the database that the settings name; an error is told with its advice, and exits 2."""
+    try:
+        # Imported late: `specimap --help` and `specimap run` need none of the service's libraries.
+        from specimap_infra.database import Database
+        from specimap_infra.migrate import migrate
+        from specimap_infra.settings import load_settings
+
+        database = Database.open(load_settings().database)
+        try:
+            # The first key comes before the first start of the service.
+            migrate(database)
+            with database.session() as session:
+                yield session
+        finally:
+            database.close()
+    except ModuleNotFoundError as error:
+        typer.echo(f"{error.name} is not installed. Install specimap[service].", err=True)
+        raise typer.Exit(REFUSED) from None
+    except SpecimapError as error:
+        typer.echo(f"{error.code}: {error}", err=True)
+        raise typer.Exit(REFUSED) from None

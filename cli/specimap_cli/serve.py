@@ -1,0 +1,148 @@
+"""``specimap serve`` and ``specimap worker``."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+
+import sqlalchemy as sa
+
+from specimap_core.errors import SettingsError
+from specimap_core.sandbox import hide_from_others
+from specimap_infra.confinement import check_confinement
+from specimap_infra.database import Database
+from specimap_infra.logs import set_up_logs
+from specimap_infra.migrate import alone, migrate
+from specimap_infra.settings import ServiceSettings, load_settings
+from specimap_infra.storage import Storage
+from specimap_infra.tables import SCOPES, ApiKey
+from specimap_workers.supervisor import Supervisor
+
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+
+
+def serve(*, workers: bool, say: Callable[[str], None]) -> None:
+    """Run the API, and a worker for each slot, until SIGINT or SIGTERM.
+
+    Raises:
+        SettingsError, DatabaseUnavailableError, StorageUnavailableError: nothing was started then.
+    """
+    import uvicorn
+
+    from specimap_service.app import create_app
+    from specimap_service.connections import Connection
+
+    settings = load_settings()
+    set_up_logs(settings)
+    check_confinement(settings)
+    hide_from_others()
+    listener = _listen(settings)
+    database = Database.open(settings.database)
+    try:
+        migrate(database)
+        Storage.open(settings).check_at_start()
+        key = _first_key(database)
+    finally:
+        database.close()
+    app = create_app(settings)
+    host, port = listener.getsockname()[:2]
+    url = settings.public_url or f"http://{f'[{host}]' if ':' in host else host}:{port}"
+    if settings.host not in LOOPBACK:
+        say(f"Listening on {settings.host}: put a TLS proxy in front, since keys travel with every request.")
+    supervisor = Supervisor(settings.slots if workers else 0)
+
+    class Server(uvicorn.Server):
+        async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+            await super().startup(sockets)
+            say(f"Specimap listens on {url}")
+            say(f"The API is described at {url}/docs")
+            if key:
+                say("First start. This is the administrator's key; it is shown this once and kept nowhere:")
+                say(key)
+
+    config = uvicorn.Config(
+        app,
+        log_config=None,
+        access_log=False,
+        ws="none",
+        lifespan="on",
+        proxy_headers=False,
+        server_header=False,
+        timeout_graceful_shutdown=5,
+        timeout_keep_alive=75,
+        http=Connection,
+    )
+    # The server raises the signal that stopped it once more at its end: the workers still have to be ended then.
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: None)
+    supervisor.start()
+    try:
+        Server(config).run(sockets=[listener])
+    finally:
+        supervisor.stop()
+
+
+def work(*, slots: int | None, kind: str) -> None:
+    """Run workers until SIGINT or SIGTERM.
+
+    Raises:
+        SettingsError, DatabaseUnavailableError, StorageUnavailableError: nothing was started then.
+    """
+    settings = load_settings()
+    set_up_logs(settings)
+    check_confinement(settings)
+    hide_from_others()
+    database = Database.open(settings.database)
+    try:
+        migrate(database)
+        Storage.open(settings).check_at_start()
+    finally:
+        database.close()
+    supervisor = Supervisor(slots or settings.slots, ("--kind", kind))
+
+    def stop(number: int, _: object) -> None:
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, stop)
+    supervisor.start()
+    try:
+        with suppress(KeyboardInterrupt):
+            supervisor.wait()
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        supervisor.stop()
+    if supervisor.refused.is_set():
+        sys.exit(2)
+
+
+def _listen(settings: ServiceSettings) -> socket.socket:
+    """The listening socket, taken first: two services on one port would share a database by accident."""
+    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((settings.host, settings.port))
+    except OSError as error:
+        listener.close()
+        raise SettingsError(
+            f"{settings.host}:{settings.port} cannot be listened on: {error.strerror}.",
+            advice="Another service may use the port: set SPECIMAP_PORT to a free one, or to 0 for any.",
+            setting="port",
+        ) from error
+    listener.set_inheritable(True)
+    return listener
+
+
+def _first_key(database: Database) -> str | None:
+    """An administrator's key where there is no key at all."""
+    from specimap_service.auth.keys import new_key
+
+    with alone(database.engine), database.session() as session:
+        if session.scalar(sa.select(sa.func.count()).select_from(ApiKey)):
+            return None
+        row, key = new_key("administrator", SCOPES)
+        session.add(row)
+    return key

@@ -1,0 +1,1 @@
+"""Stage 2: joint adjustment of cameras and marker corners."""

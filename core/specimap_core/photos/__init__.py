@@ -1,0 +1,1 @@
+"""Photos: files read, turned upright, selected and shown."""

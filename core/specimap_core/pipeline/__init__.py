@@ -1,0 +1,1 @@
+"""The four stages in order, each resumable from its artefact. Importing this package loads none of them."""

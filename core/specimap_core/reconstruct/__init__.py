@@ -1,0 +1,1 @@
+"""Stage 1: cameras, lens and depth from photos."""

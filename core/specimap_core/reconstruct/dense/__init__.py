@@ -1,0 +1,1 @@
+"""Depth of every photo, from pairs of photos."""

@@ -1,0 +1,1 @@
+"""Features of photos, found and matched."""

@@ -1,0 +1,1 @@
+"""Stage 3: orthographic grids of the surface."""

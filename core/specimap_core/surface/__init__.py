@@ -1,0 +1,1 @@
+"""The surface: fused, refined, its uncertainty."""

@@ -1,0 +1,1 @@
+"""Known truth of an acquisition, and a result judged by it."""

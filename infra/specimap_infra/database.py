@@ -1,0 +1,111 @@
+"""The database: SQLite on one machine, PostgreSQL on several; the same code on both."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import sqlalchemy as sa
+from sqlalchemy import event
+from sqlalchemy.exc import DBAPIError, OperationalError
+from sqlalchemy.orm import Session, sessionmaker
+
+from specimap_core.atomic import disk_errors
+from specimap_infra.errors import DatabaseUnavailableError
+
+CONNECT_SECONDS = 5
+
+
+def make_engine(url: str, *, pool_size: int = 10) -> sa.Engine:
+    """An engine for the SQLAlchemy URL, set up so that writers queue and a dead server is noticed."""
+    parsed = sa.make_url(url)
+    if parsed.get_backend_name() == "sqlite":
+        if parsed.database:
+            path = Path(parsed.database)
+            with disk_errors(path.parent):
+                path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        engine = sa.create_engine(parsed, pool_size=pool_size, max_overflow=20)
+
+        @event.listens_for(engine, "connect")
+        def _set_up(connection: object, _: object) -> None:
+            # As the job engine does: writers queue instead of failing in the middle of a transaction.
+            connection.isolation_level = "IMMEDIATE"  # type: ignore[attr-defined]
+            for pragma in ("busy_timeout=30000", "foreign_keys=ON", "journal_mode=WAL", "synchronous=FULL"):
+                connection.execute(f"PRAGMA {pragma}")  # type: ignore[attr-defined]
+
+        return engine
+    return sa.create_engine(
+        parsed,
+        pool_size=pool_size,
+        max_overflow=20,
+        pool_timeout=CONNECT_SECONDS,
+        pool_pre_ping=True,
+        # A server that vanished without a word is given up after ten seconds.
+        connect_args={"connect_timeout": CONNECT_SECONDS, "tcp_user_timeout": 10_000},
+    )
+
+
+class Database:
+    """Sessions on an engine."""
+
+    def __init__(self, engine: sa.Engine) -> None:
+        self.engine = engine
+        self._sessions = sessionmaker(engine, expire_on_commit=False)
+
+    @classmethod
+    def open(cls, url: str, *, pool_size: int = 10) -> Database:
+        """Open without connecting yet."""
+        return cls(make_engine(url, pool_size=pool_size))
+
+    @contextmanager
+    def session(self) -> Iterator[Session]:
+        """A transaction: committed at the end of the block, rolled back where it raises.
+
+        Raises:
+            DatabaseUnavailableError: the server cannot be reached.
+        """
+        with database_errors(), self._sessions() as session, session.begin():
+            yield session
+
+    def check(self) -> None:
+        """Raise DatabaseUnavailableError where it does not answer."""
+        with self.session() as session:
+            session.execute(sa.text("SELECT 1"))
+
+    def close(self) -> None:
+        """Close all connections."""
+        self.engine.dispose()
+
+
+@contextmanager
+def database_errors() -> Iterator[None]:
+    """Turn lost connections into one typed error; other errors pass."""
+    try:
+        yield
+    except (OperationalError, sa.exc.TimeoutError) as error:
+        raise _unavailable(error) from error
+    except DBAPIError as error:
+        if error.connection_invalidated:
+            raise _unavailable(error) from error
+        raise
+
+
+def _unavailable(error: Exception) -> DatabaseUnavailableError:
+    # The driver's text may name hosts and users: it goes to the log with the traceback, not to the caller.
+    return DatabaseUnavailableError(
+        f"The database does not answer ({type(error).__name__}).", advice="Try again in some seconds."
+    )
+
+
+def database_seconds(engine: sa.Engine) -> sa.ColumnElement[float]:
+    """Now in seconds by the database's clock, which all machines share."""
+    if engine.dialect.name == "sqlite":
+        return sa.literal_column("((julianday('now') - 2440587.5) * 86400.0)", sa.Float())
+    return sa.literal_column("extract(epoch from clock_timestamp())::double precision", sa.Float())
+
+
+def utc_now() -> datetime.datetime:
+    """Now, with the time zone."""
+    return datetime.datetime.now(datetime.UTC)

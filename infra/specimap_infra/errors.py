@@ -1,0 +1,41 @@
+"""Errors of jobs, the database and the storage, which the API and the workers share."""
+
+from __future__ import annotations
+
+from specimap_core.errors import SpecimapError
+
+
+class JobConflictError(SpecimapError, ValueError):
+    """The job's or acquisition's state does not allow what was asked."""
+
+    code = "state_conflict"
+
+
+class LostLeaseError(SpecimapError, RuntimeError):
+    """A worker wrote to a job that is not its own any more: cancelled, ended, or taken over by another."""
+
+    code = "lost_lease"
+
+
+class WorkerCrashedError(SpecimapError, RuntimeError):
+    """The job's process died again and again; ``details['stage']`` says where."""
+
+    code = "worker_crashed"
+
+
+class StageTimeoutError(SpecimapError, RuntimeError):
+    """A stage took longer than its limit and was stopped."""
+
+    code = "stage_timeout"
+
+
+class StorageUnavailableError(SpecimapError, RuntimeError):
+    """The storage cannot be reached, read or written."""
+
+    code = "storage_unavailable"
+
+
+class DatabaseUnavailableError(SpecimapError, RuntimeError):
+    """The database cannot be reached."""
+
+    code = "database_unavailable"

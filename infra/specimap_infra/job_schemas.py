@@ -1,0 +1,192 @@
+"""A job's settings, and a job as clients see it: the API answers with it, a webhook carries it."""
+
+from __future__ import annotations
+
+import datetime
+from typing import Annotated, Any, Literal
+
+import sqlalchemy as sa
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from sqlalchemy.orm import Session
+
+from specimap_core.errors import SettingsError
+from specimap_core.pipeline.limits import RANGES
+from specimap_infra.tables import PRIORITIES, Acquisition, CloudRow, Job
+
+JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+PriorityName = Literal["intraoperative", "routine", "research"]
+Dictionary = Literal[
+    "DICT_4X4_50",
+    "DICT_4X4_100",
+    "DICT_4X4_250",
+    "DICT_4X4_1000",
+    "DICT_5X5_50",
+    "DICT_5X5_100",
+    "DICT_5X5_250",
+    "DICT_5X5_1000",
+    "DICT_6X6_50",
+    "DICT_6X6_100",
+    "DICT_6X6_250",
+    "DICT_6X6_1000",
+    "DICT_7X7_50",
+    "DICT_7X7_100",
+    "DICT_7X7_250",
+    "DICT_7X7_1000",
+    "DICT_ARUCO_ORIGINAL",
+    "DICT_APRILTAG_16h5",
+    "DICT_APRILTAG_25h9",
+    "DICT_APRILTAG_36h10",
+    "DICT_APRILTAG_36h11",
+    "DICT_ARUCO_MIP_36h12",
+]
+"""OpenCV's predefined dictionaries, named here so that no service needs OpenCV to check a name."""
+EdgeMm = Annotated[
+    float,
+    Field(
+        ge=RANGES["edge_mm"][0],
+        le=RANGES["edge_mm"][1],
+        allow_inf_nan=False,
+        description="Edge of a marker's black square, mm.",
+    ),
+]
+
+
+class JobSettings(BaseModel):
+    """What a person chooses of a run; what is left out is as published."""
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"example": {"method": "camera", "r_pc": 0.5}})
+
+    method: Literal["camera", "homography"] = Field(
+        default="camera", description="`camera` removes parallax; `homography` is the published one."
+    )
+    adjustment: Literal["rigid", "free"] = Field(
+        default="rigid", description="`rigid` squares, or `free` corners as published."
+    )
+    r_pc: float = Field(
+        default=0.5,
+        ge=RANGES["r_pc"][0],
+        le=RANGES["r_pc"][1],
+        allow_inf_nan=False,
+        description="Cell of the fine grid, mm.",
+    )
+    r_reg: float = Field(
+        default=2.0,
+        ge=RANGES["r_reg"][0],
+        le=RANGES["r_reg"][1],
+        allow_inf_nan=False,
+        description="Cell of the coarse grid, mm.",
+    )
+    backend: Literal["colmap", "mast3r", "da3"] = Field(
+        default="colmap", description="Reconstruction backend; the learned ones need weights on the worker."
+    )
+    features: Literal["auto", "sift", "aliked"] = Field(
+        default="auto", description="Features that locate photos which the markers leave open."
+    )
+    working_px: int = Field(
+        default=1280,
+        ge=RANGES["working_px"][0],
+        le=RANGES["working_px"][1],
+        description="Longer side that larger photos are brought to, pixels.",
+    )
+    dictionary: Dictionary | None = Field(default=None, description="Marker dictionary; by default the acquisition's.")
+    edge_mm: EdgeMm | None = Field(default=None, description="Edge of a marker, mm; by default the acquisition's.")
+
+    def on(self, acquisition: Acquisition) -> dict[str, Any]:
+        """All settings with values, what is left out taken from the acquisition: the arguments of a run.
+
+        Raises:
+            SettingsError: what the acquisition says cannot be used.
+        """
+        given = self.model_dump(exclude_none=True)
+        own = {"dictionary": acquisition.dictionary, "edge_mm": acquisition.edge_mm}
+        return job_settings({**own, **given}).model_dump()
+
+
+def job_settings(given: dict[str, Any]) -> JobSettings:
+    """Settings from a row or a program.
+
+    Raises:
+        SettingsError: a setting is unknown or out of its range; details name the first.
+    """
+    try:
+        return JobSettings.model_validate(given)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(str(part) for part in first["loc"])
+        raise SettingsError(f"{name}: {first['msg']}.", advice="Correct the job's settings.", setting=name) from error
+
+
+class JobFailure(BaseModel):
+    """Why a job failed."""
+
+    code: str = Field(description="Stable code; docs/errors.md lists all.")
+    message: str
+    advice: str
+    details: dict[str, Any]
+
+
+class JobView(BaseModel):
+    """A run of the pipeline on an acquisition."""
+
+    model_config = ConfigDict(title="Job")
+
+    id: str
+    acquisition_id: str
+    settings: JobSettings
+    priority: PriorityName
+    state: JobState
+    stage: Literal["reconstruct", "adjust", "render", "register"] | None = Field(
+        description="The stage it is in, or was in last."
+    )
+    progress: float = Field(description="Share of the stage that is done, 0 to 1.")
+    error: JobFailure | None
+    starts: int = Field(description="How often a worker took it up.")
+    rerun_of: str | None = Field(description="The job that this one repeats.")
+    cloud_id: str | None = Field(description="Its result, once it has succeeded.")
+    seconds: dict[str, float] = Field(description="Time that each stage took, by its name.")
+    created_at: datetime.datetime
+    started_at: datetime.datetime | None
+    finished_at: datetime.datetime | None
+    queue_position: int | None = Field(description="Queued jobs that come before it; null unless it is queued.")
+
+
+def job_views(session: Session, jobs: list[Job]) -> list[JobView]:
+    """Jobs as clients see them, in the given order."""
+    ids = [job.id for job in jobs]
+    rows = session.execute(sa.select(CloudRow.job_id, CloudRow.id).where(CloudRow.job_id.in_(ids)))
+    clouds = {row.job_id: row.id for row in rows}
+    positions = queue_positions(session, [job.id for job in jobs if job.state == "queued"])
+    names = {number: name for name, number in PRIORITIES.items()}
+    return [
+        JobView.model_validate(
+            {
+                "id": job.id,
+                "acquisition_id": job.acquisition_id,
+                "settings": job.settings,
+                "priority": names[job.priority],
+                "state": job.state,
+                "stage": job.stage,
+                "progress": job.progress,
+                "error": job.error,
+                "starts": job.starts,
+                "rerun_of": job.rerun_of,
+                "cloud_id": clouds.get(job.id),
+                "seconds": job.seconds,
+                "created_at": job.created_at,
+                "started_at": job.started_at,
+                "finished_at": job.finished_at,
+                "queue_position": positions.get(job.id),
+            }
+        )
+        for job in jobs
+    ]
+
+
+def queue_positions(session: Session, ids: list[str]) -> dict[str, int]:
+    """How many queued jobs come before each of these, by priority, then age."""
+    if not ids:
+        return {}
+    place = sa.func.row_number().over(order_by=(Job.priority, Job.created_at, Job.id)) - 1
+    queued = sa.select(Job.id, place.label("place")).where(Job.state == "queued").subquery()
+    rows = session.execute(sa.select(queued.c.id, queued.c.place).where(queued.c.id.in_(ids)))
+    return {job_id: int(position) for job_id, position in rows}

@@ -1,0 +1,1 @@
+"""Alembic's scripts; ``specimap_infra.migrate`` runs them."""

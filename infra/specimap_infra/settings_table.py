@@ -1,0 +1,80 @@
+"""``python -m specimap_infra.settings_table``: the tables of docs/settings.md, made from the settings themselves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+
+from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES
+from specimap_infra.settings import GIB, MIB, ServiceSettings
+
+DATA_DIR = "`$XDG_DATA_HOME/specimap`, else `~/.local/share/specimap`"
+HEADER = "| variable | default | takes | meaning |\n|---|---|---|---|"
+OF_BACKENDS = (
+    "Of backends and devices, for `specimap worker`, `serve` and `run` alike; from the environment alone, not from the "
+    "file.\nDefaults and what they take: [backends.md](backends.md)."
+)
+
+
+def settings_table() -> str:
+    """All settings as a Markdown table, one a line, in the order of the class."""
+    return "\n".join([HEADER, *(_row(name, field) for name, field in ServiceSettings.model_fields.items())])
+
+
+def backends_table() -> str:
+    """The variables of backends and devices as a Markdown table, one a line."""
+    rows = (f"| `{name}` | {meaning} |" for name, meaning in BACKEND_VARIABLES.items())
+    return "\n".join(["| variable | meaning |\n|---|---|", *rows])
+
+
+def page_part() -> str:
+    """Both tables, as docs/settings.md holds them."""
+    return f"{settings_table()}\n\n{OF_BACKENDS}\n\n{backends_table()}"
+
+
+def _row(name: str, field: FieldInfo) -> str:
+    cells = (f"`SPECIMAP_{name.upper()}`", _default(name, field), _takes(name, field), field.description or "")
+    # A bar would end the cell, even within a code span.
+    return "| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"
+
+
+def _default(name: str, field: FieldInfo) -> str:
+    if name == "data_dir":
+        return DATA_DIR  # the one default that depends on who asks
+    value = field.get_default(call_default_factory=True, validated_data={})
+    if value is PydanticUndefined:
+        raise TypeError(f"{name} has no default")
+    if value in ("", None):
+        return ""
+    if name.endswith("_bytes"):
+        for unit, size in (("GiB", GIB), ("MiB", MIB)):
+            if value and value % size == 0:
+                return f"{value} ({value // size} {unit})"
+    return f"`{value}`" if isinstance(value, str | list) else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _takes(name: str, field: FieldInfo) -> str:
+    kind: Any = field.annotation
+    if get_origin(kind) is Literal:
+        return ", ".join(f"`{choice}`" for choice in get_args(kind))
+    if kind in (Path, Path | None):
+        return "a folder"
+    if kind == list[str]:
+        return "a JSON list of text"
+    if kind is str:
+        return "text"
+    noun = {int: "whole number", float: "number"}[kind]
+    limits = [f"{word} {value}" for word, value in _limits(field)]
+    return ", ".join([noun, *limits])
+
+
+def _limits(field: FieldInfo) -> list[tuple[str, object]]:
+    words = {"ge": "at least", "gt": "above", "le": "at most"}
+    return [(words[word], getattr(rule, word)) for rule in field.metadata for word in words if hasattr(rule, word)]
+
+
+if __name__ == "__main__":
+    print(page_part())

@@ -1,0 +1,318 @@
+"""Where files lie that several processes share: a folder, or a bucket of an S3-compatible store.
+
+Keys are paths of safe names made by the program (``jobs/job_…/register/att_…/cloud.zarr/zarr.json``); names that a
+person gave never become part of one. Files appear whole; a folder's files are referred to only once all are there.
+"""
+
+from __future__ import annotations
+
+import datetime
+import os
+import re
+import shutil
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import obstore
+from obstore.store import LocalStore, S3Store
+
+from specimap_core.atomic import disk_errors, remove
+from specimap_core.errors import NotFoundError, OutputNotWritableError, SettingsError, StorageFullError
+from specimap_infra.errors import StorageUnavailableError
+from specimap_infra.logs import logger
+from specimap_infra.settings import ServiceSettings
+
+PART = re.compile(r"^[A-Za-z0-9_=-][A-Za-z0-9._=-]*$")
+CHUNK = 1024 * 1024
+TEMPORARY = "tmp"
+"""Folder in a local storage for what is being written; what killed writers left there may be removed after a day."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """A stored file."""
+
+    key: str
+    size: int
+    etag: str
+    modified: datetime.datetime
+
+
+class Storage:
+    """Files by key. Safe to share between threads.
+
+    All methods raise StorageUnavailableError where the store does not answer; writing ones raise StorageFullError.
+    """
+
+    def __init__(self, store: LocalStore | S3Store, folder: Path | None, scratch: Path) -> None:
+        self._store = store
+        self.folder = folder
+        """The folder, where the storage is one."""
+        self._scratch = scratch
+
+    @classmethod
+    def open(cls, settings: ServiceSettings) -> Self:
+        """Open the storage that the settings name.
+
+        Raises:
+            SettingsError: it cannot be made.
+        """
+        place = settings.storage_place
+        with disk_errors(settings.scratch):
+            # Each by itself: the folders above one that is made with its parents get the usual rights.
+            for private in (settings.data_dir, settings.scratch):
+                private.mkdir(parents=True, exist_ok=True, mode=0o700)
+        if not place.startswith("s3://"):
+            folder = Path(place).absolute()
+            with disk_errors(folder):
+                for private in (folder, folder / TEMPORARY):
+                    private.mkdir(parents=True, exist_ok=True, mode=0o700)
+            return cls(LocalStore(folder), folder, settings.scratch)
+        bucket, _, prefix = place.removeprefix("s3://").partition("/")
+        try:
+            store = S3Store(
+                bucket,
+                prefix=prefix or None,
+                endpoint=settings.s3_endpoint or None,
+                region=settings.s3_region,
+                virtual_hosted_style_request=False,
+                client_options={"allow_http": settings.s3_endpoint.startswith("http://"), "timeout": "60s"},
+                retry_config={"max_retries": 4, "retry_timeout": datetime.timedelta(seconds=30)},
+            )
+        except (ValueError, obstore.exceptions.BaseError) as error:
+            raise SettingsError(
+                f"The storage {place} cannot be opened: {error}.", advice="Correct SPECIMAP_STORAGE.", setting="storage"
+            ) from error
+        return cls(store, None, settings.scratch)
+
+    # ---- reading --------------------------------------------------------------------------------------
+
+    def path(self, key: str) -> Path | None:
+        """The file or folder itself, where the storage is a folder; it need not exist."""
+        return None if self.folder is None else self.folder / checked(key)
+
+    def stat(self, key: str) -> Stored:
+        """Size and ETag. Raises NotFoundError."""
+        with _store_errors(key):
+            return _stored(obstore.head(self._store, checked(key)))
+
+    def read(self, key: str, start: int = 0, stop: int | None = None) -> bytes:
+        """The file's bytes from ``start`` up to ``stop``. Raises NotFoundError."""
+        with _store_errors(key):
+            if start == 0 and stop is None:
+                return bytes(obstore.get(self._store, checked(key)).bytes())
+            end = self.stat(key).size if stop is None else stop
+            return bytes(obstore.get_range(self._store, checked(key), start=start, end=end)) if end > start else b""
+
+    def stream(self, key: str, start: int = 0, stop: int | None = None) -> Iterator[bytes]:
+        """The same piece by piece. Raises NotFoundError before the first piece."""
+        local = self.path(key)
+        if local is not None:
+            with _store_errors(key), open(local, "rb") as file:
+                file.seek(start)
+                left = (stop if stop is not None else os.fstat(file.fileno()).st_size) - start
+                while left > 0 and (piece := file.read(min(CHUNK, left))):
+                    left -= len(piece)
+                    yield piece
+            return
+        at, end = start, self.stat(key).size if stop is None else stop
+        while at < end:
+            piece = self.read(key, at, min(at + 8 * CHUNK, end))
+            at += len(piece)
+            yield piece
+
+    def list(self, prefix: str) -> Iterator[Stored]:
+        """All files below a prefix."""
+        with _store_errors(prefix):
+            for batch in obstore.list(self._store, checked(prefix) + "/"):
+                yield from map(_stored, batch)
+
+    def fetch(self, key: str, target: Path) -> None:
+        """Put a file, or all files below a prefix, at ``target``: by link where it can be, else by copy."""
+        local = self.path(key)
+        with disk_errors(target):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if local is not None:
+                if not local.exists():
+                    raise _not_found(key)
+                # A link costs nothing and keeps the data for a running stage when the file is deleted meanwhile.
+                shutil.copytree(local, target, copy_function=_link) if local.is_dir() else _link(local, target)
+                return
+            found = list(self.list(key))
+            for item in found:
+                self._download(item.key, target / item.key.removeprefix(f"{key}/"))
+            if not found:
+                self._download(key, target)
+
+    def _download(self, key: str, target: Path) -> None:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        aside = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.tmp")
+        try:
+            with open(aside, "wb") as file:
+                for piece in self.stream(key):
+                    file.write(piece)
+            aside.replace(target)
+        finally:
+            remove(aside)
+
+    # ---- writing --------------------------------------------------------------------------------------
+
+    def put(self, key: str, data: bytes) -> None:
+        """Write a file whole or not at all."""
+        with _store_errors(key):
+            obstore.put(self._store, checked(key), data)
+
+    def put_file(self, key: str, source: Path) -> None:
+        """Move a local file into the storage, whole or not at all; ``source`` is gone afterwards."""
+        local = self.path(key)
+        with _store_errors(key):
+            if local is None:
+                obstore.put(self._store, checked(key), source, chunk_size=16 * CHUNK)
+                source.unlink()
+                return
+            with disk_errors(local):
+                local.parent.mkdir(parents=True, exist_ok=True)
+                _flush(source)
+                try:
+                    os.replace(source, local)
+                except OSError:  # on another disk
+                    aside = self._aside(local.name)
+                    try:
+                        shutil.copyfile(source, aside)
+                        _flush(aside)
+                        os.replace(aside, local)
+                    finally:
+                        remove(aside)
+                    source.unlink()
+                _flush(local.parent)
+
+    @contextmanager
+    def publishing(self, prefix: str) -> Iterator[Path]:
+        """A local folder to fill; its files are stored below ``prefix`` when the block succeeds.
+
+        In a folder they appear together, by one rename. In a bucket they come one by one: nothing may refer to the
+        prefix before the block has ended.
+        """
+        local = self.path(prefix)
+        aside = self._aside(prefix.rsplit("/", 1)[-1]) if local else self._scratch / f"{uuid.uuid4().hex}.tmp"
+        with disk_errors(aside):
+            aside.mkdir(parents=True)
+        try:
+            yield aside
+            with _store_errors(prefix):
+                if local is not None:
+                    local.parent.mkdir(parents=True, exist_ok=True)
+                    os.rename(aside, local)
+                    _flush(local.parent)
+                    return
+                for file in sorted(p for p in aside.rglob("*") if p.is_file()):
+                    self.put_file(f"{prefix}/{file.relative_to(aside).as_posix()}", file)
+        finally:
+            remove(aside)
+
+    def delete(self, key: str) -> None:
+        """Remove a file, or all files below a prefix; not an error where there is none."""
+        local = self.path(key)
+        with _store_errors(key):
+            if local is not None:
+                if local.is_dir():
+                    # Out of sight at once, then file by file.
+                    aside = self._aside(local.name)
+                    os.rename(local, aside)
+                    remove(aside)
+                else:
+                    local.unlink(missing_ok=True)
+                return
+            keys = [item.key for item in self.list(key)]
+            for at in range(0, len(keys), 1000):
+                obstore.delete(self._store, keys[at : at + 1000])
+            obstore.delete(self._store, checked(key))
+
+    def _aside(self, name: str) -> Path:
+        assert self.folder is not None
+        return self.folder / TEMPORARY / f"{name}.{uuid.uuid4().hex[:8]}.tmp"
+
+    # ---- state ----------------------------------------------------------------------------------------
+
+    def free_bytes(self) -> int | None:
+        """Free space of the folder's disk; None for a bucket."""
+        if self.folder is None:
+            return None
+        with _store_errors(str(self.folder)):
+            return shutil.disk_usage(self.folder).free
+
+    def check_at_start(self) -> None:
+        """As :meth:`check`, but a full storage is warned of only: a service that starts can still be tidied up."""
+        try:
+            self.check()
+        except StorageFullError:
+            logger().warning("the storage is full: new uploads are refused, and jobs may fail")
+
+    def check(self) -> None:
+        """Raise StorageUnavailableError or StorageFullError where nothing can be written."""
+        key = f"{TEMPORARY}/check-{uuid.uuid4().hex}"
+        self.put(key, b"1")
+        self.delete(key)
+
+
+def checked(key: str) -> str:
+    """The key, if it is made of safe names. Raises NotFoundError: no other key ever exists."""
+    parts = key.split("/")
+    if not all(PART.match(part) for part in parts):
+        raise _not_found(key)
+    return key
+
+
+def _not_found(key: str) -> NotFoundError:
+    return NotFoundError(f"There is no {key[:200]!r} in the storage.", advice="It may have been deleted.")
+
+
+def _stored(meta: obstore.ObjectMeta) -> Stored:
+    etag = (meta["e_tag"] or f"{meta['size']:x}-{meta['last_modified'].timestamp():x}").strip('"')
+    return Stored(meta["path"], meta["size"], etag, meta["last_modified"])
+
+
+def _link(source: str | Path, target: str | Path) -> object:
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
+    return target
+
+
+def _flush(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def _store_errors(key: str) -> Iterator[None]:
+    try:
+        with disk_errors(Path(key)):
+            yield
+    except (StorageFullError, StorageUnavailableError, NotFoundError):
+        raise
+    except FileNotFoundError as error:
+        raise _not_found(key) from error
+    except OutputNotWritableError as error:
+        if isinstance(error.__cause__, FileNotFoundError | NotADirectoryError):
+            raise _not_found(key) from error
+        raise _unavailable(error) from error
+    except (obstore.exceptions.BaseError, OSError) as error:
+        if "No space left" in str(error) or "os error 28" in str(error):
+            raise StorageFullError("The storage is full.", advice="Free space; finished results are kept.") from error
+        raise _unavailable(error) from error
+
+
+def _unavailable(error: Exception) -> StorageUnavailableError:
+    # What the store says may name buckets and accounts: it goes to the log with the traceback.
+    return StorageUnavailableError(
+        f"The storage does not answer, or cannot be written ({type(error).__name__}).", advice="Try again later."
+    )

@@ -1,0 +1,284 @@
+"""The tables. Rows that hang on an acquisition or a job go with it."""
+
+from __future__ import annotations
+
+import datetime
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+
+from specimap_infra.database import utc_now
+
+JOB_STATES = ("queued", "running", "succeeded", "failed", "cancelled")
+FINAL_STATES = ("succeeded", "failed", "cancelled")
+PRIORITIES = {"intraoperative": 1, "routine": 5, "research": 9}
+SCOPES = ("upload", "read", "label", "admin")
+ROLES = ("photo", "cube", "white", "dark")
+
+
+class UtcDateTime(sa.types.TypeDecorator[datetime.datetime]):
+    """Aware datetimes in UTC on every database; SQLite keeps no zone of its own."""
+
+    impl = sa.DateTime
+    cache_ok = True
+
+    def process_bind_param(self, value: datetime.datetime | None, dialect: sa.Dialect) -> datetime.datetime | None:
+        """Naive UTC for the database."""
+        return None if value is None else value.astimezone(datetime.UTC).replace(tzinfo=None)
+
+    def process_result_value(self, value: datetime.datetime | None, dialect: sa.Dialect) -> datetime.datetime | None:
+        """Aware UTC for the program."""
+        return None if value is None else value.replace(tzinfo=datetime.UTC)
+
+
+class Base(DeclarativeBase):
+    """Root of the tables; JSON columns are plain JSON on both databases."""
+
+    type_annotation_map = {  # noqa: RUF012 - SQLAlchemy's own interface
+        dict[str, Any]: sa.JSON,
+        list[str]: sa.JSON,
+        list[Any]: sa.JSON,
+        datetime.datetime: UtcDateTime,
+    }
+    metadata = sa.MetaData(
+        naming_convention={
+            "ix": "ix_%(column_0_label)s",
+            "uq": "uq_%(table_name)s_%(column_0_name)s",
+            "fk": "fk_%(table_name)s_%(column_0_name)s_%(referred_table_name)s",
+            "pk": "pk_%(table_name)s",
+        }
+    )
+
+
+def _owned_by(table: str, **options: Any) -> Any:
+    return mapped_column(sa.ForeignKey(f"{table}.id", ondelete="CASCADE"), index=True, **options)
+
+
+class ApiKey(Base):
+    """A key; only the hash of its secret is kept."""
+
+    __tablename__ = "api_keys"
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    name: Mapped[str]
+    secret_hash: Mapped[str]
+    scopes: Mapped[list[str]]
+    created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now)
+    expires_at: Mapped[datetime.datetime | None]
+    revoked_at: Mapped[datetime.datetime | None]
+    last_used_at: Mapped[datetime.datetime | None]
+    rate_per_minute: Mapped[int | None]
+    quota_bytes: Mapped[int | None] = mapped_column(sa.BigInteger)
+
+
+class Acquisition(Base):
+    """What was captured of one specimen."""
+
+    __tablename__ = "acquisitions"
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    specimen_id: Mapped[str] = mapped_column(index=True)
+    accession_number: Mapped[str | None] = mapped_column(index=True)
+    dictionary: Mapped[str]
+    edge_mm: Mapped[float]
+    notes: Mapped[str]
+    created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now, index=True)
+    created_by: Mapped[str] = mapped_column(index=True)
+
+
+class StoredFile(Base):
+    """A file of an acquisition; ``label`` is the name that results speak of, ``name`` the one it came with."""
+
+    __tablename__ = "files"
+    __table_args__ = (sa.UniqueConstraint("acquisition_id", "label"),)
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    acquisition_id: Mapped[str] = _owned_by("acquisitions")
+    role: Mapped[str]
+    label: Mapped[str]
+    name: Mapped[str]
+    size: Mapped[int] = mapped_column(sa.BigInteger)
+    sha256: Mapped[str]
+    storage_key: Mapped[str]
+    state: Mapped[str]
+    """``accepted``, or ``refused``: it takes no part in a job and is there to be retaken."""
+    judgement: Mapped[dict[str, Any]]
+    created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now)
+    created_by: Mapped[str] = mapped_column(index=True)
+
+
+class Upload(Base):
+    """A resumable upload under way, or what became of it."""
+
+    __tablename__ = "uploads"
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    acquisition_id: Mapped[str] = _owned_by("acquisitions")
+    role: Mapped[str]
+    name: Mapped[str]
+    size: Mapped[int] = mapped_column(sa.BigInteger)
+    state: Mapped[str]
+    """``open``, ``finished`` (``file_id`` says which file), ``failed`` (``error``), ``expired`` or ``terminated``."""
+    file_id: Mapped[str | None]
+    error: Mapped[dict[str, Any] | None]
+    created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now)
+    expires_at: Mapped[datetime.datetime] = mapped_column(index=True)
+    created_by: Mapped[str] = mapped_column(index=True)
+
+
+class Job(Base):
+    """A run of the pipeline on an acquisition. ``id`` is the workflow's id at the job engine too."""
+
+    __tablename__ = "jobs"
+    __table_args__ = (sa.UniqueConstraint("created_by", "idempotency_key"),)
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    acquisition_id: Mapped[str] = _owned_by("acquisitions")
+    settings: Mapped[dict[str, Any]]
+    priority: Mapped[int]
+    state: Mapped[str] = mapped_column(index=True)
+    stage: Mapped[str | None]
+    progress: Mapped[float] = mapped_column(default=0.0)
+    """Share of the running stage, 0 to 1."""
+    error: Mapped[dict[str, Any] | None]
+    """Code, message, advice and details of the failure."""
+    starts: Mapped[int] = mapped_column(default=0)
+    executor: Mapped[str | None]
+    """Who may write to this row: a worker that lost its lease finds another's name here."""
+    idempotency_key: Mapped[str | None]
+    request_hash: Mapped[str]
+    correlation_id: Mapped[str]
+    rerun_of: Mapped[str | None]
+    webhook: Mapped[dict[str, Any] | None]
+    seconds: Mapped[dict[str, Any]] = mapped_column(default=dict)
+    created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now, index=True)
+    started_at: Mapped[datetime.datetime | None]
+    finished_at: Mapped[datetime.datetime | None]
+    created_by: Mapped[str]
+
+
+class JobEvent(Base):
+    """What happened to a job, in order: state, progress, log lines. ``seq`` is the event id that clients resume by."""
+
+    __tablename__ = "job_events"
+
+    job_id: Mapped[str] = mapped_column(sa.ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True)
+    seq: Mapped[int] = mapped_column(primary_key=True)
+    type: Mapped[str]
+    """``state``, ``progress`` or ``log``."""
+    data: Mapped[dict[str, Any]]
+    at: Mapped[datetime.datetime] = mapped_column(default=utc_now)
+
+
+class Artefact(Base):
+    """What a finished stage left: found again by the hash of all that went into it."""
+
+    __tablename__ = "artefacts"
+    __table_args__ = (sa.UniqueConstraint("acquisition_id", "stage", "key"),)
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    acquisition_id: Mapped[str] = _owned_by("acquisitions")
+    stage: Mapped[str]
+    key: Mapped[str]
+    storage_key: Mapped[str]
+    size: Mapped[int] = mapped_column(sa.BigInteger)
+    seconds: Mapped[float]
+    created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now)
+
+
+class CloudRow(Base):
+    """A finished result: a folder ``prefix`` in the storage with cloud.zarr, mesh.ply, report.json and the rest."""
+
+    __tablename__ = "clouds"
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    job_id: Mapped[str] = _owned_by("jobs", unique=True)
+    acquisition_id: Mapped[str] = _owned_by("acquisitions")
+    prefix: Mapped[str]
+    points: Mapped[int]
+    bands: Mapped[int]
+    size: Mapped[int] = mapped_column(sa.BigInteger)
+    report: Mapped[dict[str, Any]]
+    created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now, index=True)
+
+
+class LabelVersion(Base):
+    """One version of a label layer of a cloud; the highest is the current one."""
+
+    __tablename__ = "labels"
+
+    cloud_id: Mapped[str] = mapped_column(sa.ForeignKey("clouds.id", ondelete="CASCADE"), primary_key=True)
+    name: Mapped[str] = mapped_column(primary_key=True)
+    version: Mapped[int] = mapped_column(primary_key=True)
+    kind: Mapped[str]
+    """``class`` or ``probability``."""
+    classes: Mapped[list[Any]]
+    """One object a class: value, name, colour."""
+    made_by: Mapped[dict[str, Any]]
+    storage_prefix: Mapped[str]
+    sha256: Mapped[str]
+    created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now)
+    created_by: Mapped[str]
+
+
+class Export(Base):
+    """A file made from a result on request, once."""
+
+    __tablename__ = "exports"
+    __table_args__ = (sa.UniqueConstraint("cloud_id", "format"),)
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    cloud_id: Mapped[str] = _owned_by("clouds")
+    format: Mapped[str]
+    state: Mapped[str]
+    """As of a job."""
+    storage_key: Mapped[str | None]
+    size: Mapped[int | None] = mapped_column(sa.BigInteger)
+    error: Mapped[dict[str, Any] | None]
+    executor: Mapped[str | None]
+    labels_hash: Mapped[str] = mapped_column(default="")
+    """Of the label layers in it, where it holds them: whether it is still what would be made now."""
+    correlation_id: Mapped[str]
+    created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now)
+    created_by: Mapped[str]
+
+
+class Delivery(Base):
+    """A webhook to be delivered, and how that went."""
+
+    __tablename__ = "deliveries"
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    job_id: Mapped[str] = _owned_by("jobs")
+    state: Mapped[str]
+    """``pending``, ``delivered`` or ``given_up``."""
+    attempts: Mapped[int] = mapped_column(default=0)
+    next_at: Mapped[datetime.datetime] = mapped_column(default=utc_now, index=True)
+    last_status: Mapped[str | None]
+
+
+class Lease(Base):
+    """A worker that says it is alive, in seconds of the database's clock."""
+
+    __tablename__ = "leases"
+
+    executor: Mapped[str] = mapped_column(primary_key=True)
+    host: Mapped[str]
+    kind: Mapped[str]
+    started: Mapped[float]
+    heartbeat: Mapped[float]
+
+
+class AuditEntry(Base):
+    """Who did what to which thing. Never deleted with the thing."""
+
+    __tablename__ = "audit"
+
+    id: Mapped[int] = mapped_column(sa.BigInteger().with_variant(sa.Integer, "sqlite"), primary_key=True)
+    at: Mapped[datetime.datetime] = mapped_column(default=utc_now, index=True)
+    key_id: Mapped[str]
+    action: Mapped[str]
+    target: Mapped[str] = mapped_column(index=True)
+    details: Mapped[dict[str, Any]]
+    correlation_id: Mapped[str]

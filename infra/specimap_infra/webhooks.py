@@ -1,0 +1,163 @@
+"""Webhooks: a signed POST when a job has ended, at least once; the id of the delivery tells repetitions."""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import hmac
+import ssl
+from dataclasses import dataclass
+from typing import Any
+
+import httpx
+import sqlalchemy as sa
+
+from specimap_core.errors import SettingsError
+from specimap_core.json_text import json_text
+from specimap_infra.database import Database, utc_now
+from specimap_infra.job_schemas import job_views
+from specimap_infra.logs import logger
+from specimap_infra.settings import ServiceSettings
+from specimap_infra.tables import Delivery, Job
+
+SIGNATURE = "X-Specimap-Signature"
+DELIVERY = "X-Specimap-Delivery"
+TIMEOUT_SECONDS = 10.0
+CLAIM = datetime.timedelta(seconds=90)
+"""How long a delivery under way is nobody else's; one whose sender died is due again after it."""
+LONGEST_WAIT_SECONDS = 900
+MOST_AT_ONCE = 50
+LARGEST_BODY = 256 * 1024
+
+
+@dataclass(frozen=True)
+class _Claimed:
+    id: str
+    attempt: int
+    url: str
+    secret: str
+    job: dict[str, Any]
+
+
+def sign(secret: str, body: bytes, at: int) -> str:
+    """The signature's header: ``t=<unix seconds>,v1=<hex>``, HMAC-SHA256 of ``<t>.<body>``."""
+    digest = hmac.new(secret.encode(), f"{at}.".encode() + body, hashlib.sha256).hexdigest()
+    return f"t={at},v1={digest}"
+
+
+def check_target(url: str, settings: ServiceSettings) -> None:
+    """Refuse an address that no webhook may go to.
+
+    Raises:
+        SettingsError: it is no web address, carries a password, or its host is not in ``webhook_hosts``.
+    """
+    try:
+        target = httpx.URL(url)
+    except httpx.InvalidURL as error:
+        raise _refused("The webhook's url does not read as one.") from error
+    if target.scheme not in ("http", "https") or not target.host or target.userinfo:
+        raise _refused("The webhook's url is not http(s)://HOST/PATH.")
+    allowed = {host.lower() for host in settings.webhook_hosts}
+    port = target.port or {"http": 80, "https": 443}[target.scheme]
+    if not {target.host.lower(), f"{target.host.lower()}:{port}"} & allowed:
+        raise _refused("The webhook's host is not one that this service may send to.")
+
+
+def _refused(message: str) -> SettingsError:
+    return SettingsError(
+        message, advice="Ask whoever runs the service to name the host in webhook_hosts.", setting="webhook.url"
+    )
+
+
+def webhook_client() -> httpx.Client:
+    """A client that goes straight to the host and nowhere else: no proxy from the environment, no redirect."""
+    return httpx.Client(
+        trust_env=False,
+        follow_redirects=False,
+        timeout=TIMEOUT_SECONDS,
+        # The system's certificates, which a hospital's own authority is among; httpx brings its own list.
+        verify=ssl.create_default_context(),
+        headers={"User-Agent": "specimap", "Content-Type": "application/json"},
+    )
+
+
+def deliver_due(database: Database, settings: ServiceSettings, client: httpx.Client) -> int:
+    """Send what is due, one after the other; several workers may do so at once and share the work.
+
+    Args:
+        client: as :func:`webhook_client` makes it.
+
+    Returns: how many were attempted, at most 50.
+
+    Raises:
+        DatabaseUnavailableError: the database went away; what was under way is due again after 90 s.
+    """
+    now = utc_now()
+    for done in range(MOST_AT_ONCE):
+        claimed = _claim(database, now)
+        if claimed is None:
+            return done
+        status, delivered = _send(claimed, settings, client)
+        _note(database, settings, claimed, status, delivered)
+    return MOST_AT_ONCE
+
+
+def _claim(database: Database, now: datetime.datetime) -> _Claimed | None:
+    due = sa.and_(Delivery.state == "pending", Delivery.next_at <= now)
+    while True:
+        with database.session() as session:
+            row = session.scalars(
+                sa.select(Delivery).where(due).order_by(Delivery.next_at).limit(1).with_for_update(skip_locked=True)
+            ).first()
+            if row is None:
+                return None
+            # SQLite locks no row that is read: whoever changes it first has it.
+            taken = session.execute(
+                sa.update(Delivery)
+                .where(Delivery.id == row.id, Delivery.attempts == row.attempts, due)
+                .values(attempts=row.attempts + 1, next_at=utc_now() + CLAIM)
+                .returning(Delivery.attempts),
+                execution_options={"synchronize_session": False},
+            ).scalar()
+            job = session.get(Job, row.job_id)
+            if taken is None or job is None:
+                continue
+            (view,) = job_views(session, [job])
+            webhook = job.webhook or {}
+            return _Claimed(row.id, taken, webhook["url"], webhook["secret"], view.model_dump(mode="json"))
+
+
+def _send(claimed: _Claimed, settings: ServiceSettings, client: httpx.Client) -> tuple[str, bool]:
+    """One attempt: what came of it in a word, and whether it was taken."""
+    try:
+        check_target(claimed.url, settings)
+    except SettingsError:
+        return "host not allowed", False
+    sent = utc_now()
+    content = {"event": f"job.{claimed.job['state']}", "job": claimed.job, "delivered_at": sent.isoformat()}
+    body = json_text(content).encode()
+    if len(body) > LARGEST_BODY and claimed.job["error"]:
+        content["job"] = {**claimed.job, "error": {**claimed.job["error"], "details": {}}}
+        body = json_text(content).encode()
+    headers = {SIGNATURE: sign(claimed.secret, body, int(sent.timestamp())), DELIVERY: claimed.id}
+    try:
+        # Streamed, so that an endless answer is not read.
+        with client.stream("POST", claimed.url, content=body, headers=headers) as answer:
+            return str(answer.status_code), answer.is_success
+    except (httpx.HTTPError, httpx.InvalidURL, ValueError) as error:
+        return type(error).__name__, False
+
+
+def _note(database: Database, settings: ServiceSettings, claimed: _Claimed, status: str, delivered: bool) -> None:
+    last = claimed.attempt >= settings.webhook_attempts
+    state = "delivered" if delivered else "given_up" if last else "pending"
+    wait = datetime.timedelta(seconds=min(2.0**claimed.attempt, LONGEST_WAIT_SECONDS))
+    with database.session() as session:
+        session.execute(
+            # Where another has sent it meanwhile, its word counts.
+            sa.update(Delivery)
+            .where(Delivery.id == claimed.id, Delivery.attempts == claimed.attempt, Delivery.state == "pending")
+            .values(state=state, last_status=status, next_at=utc_now() + wait)
+        )
+    log = logger().info if delivered else logger().warning
+    log("webhook", delivery=claimed.id, job=claimed.job["id"], attempt=claimed.attempt, status=status, state=state)

@@ -1,0 +1,1 @@
+"""Acquisitions, their files and how these are judged."""

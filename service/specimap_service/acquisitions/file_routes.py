@@ -1,0 +1,79 @@
+"""Files of an acquisition: listed with their judgement, read, deleted."""
+
+from __future__ import annotations
+
+from pathlib import PurePosixPath
+
+import sqlalchemy as sa
+from fastapi import APIRouter, Request, Response
+from sqlalchemy.orm import Session
+
+from specimap_core.errors import NotFoundError
+from specimap_core.photos.formats import MEDIA_TYPES
+from specimap_infra.tables import Acquisition, StoredFile
+from specimap_service.acquisitions.capacity import (
+    locked_acquisition,
+    no_acquisition,
+)
+from specimap_service.acquisitions.intake import forget_part
+from specimap_service.acquisitions.routes import check_idle
+from specimap_service.acquisitions.schemas import AcquisitionId, File, FileId
+from specimap_service.auth.keys import Reader, Uploader
+from specimap_service.byte_ranges import ranged_response
+from specimap_service.context import Context, audit
+
+router = APIRouter(prefix="/v1", tags=["files"])
+
+
+@router.get("/acquisitions/{acquisition_id}/files")
+def list_files(context: Context, principal: Reader, acquisition_id: AcquisitionId) -> list[File]:
+    """All files with their judgement, in the order in which they came."""
+    with context.database.session() as session:
+        if session.get(Acquisition, acquisition_id) is None:
+            raise no_acquisition(acquisition_id)
+        rows = session.scalars(
+            sa.select(StoredFile).where(StoredFile.acquisition_id == acquisition_id).order_by(StoredFile.id)
+        )
+        return [File.model_validate(row) for row in rows]
+
+
+@router.get("/acquisitions/{acquisition_id}/files/{file_id}")
+def get_file(context: Context, principal: Reader, acquisition_id: AcquisitionId, file_id: FileId) -> File:
+    """One file."""
+    with context.database.session() as session:
+        return File.model_validate(_found(session, acquisition_id, file_id))
+
+
+@router.get(
+    "/acquisitions/{acquisition_id}/files/{file_id}/content",
+    response_class=Response,
+    responses={200: {"content": {"application/octet-stream": {}}}, 206: {"content": {"application/octet-stream": {}}}},
+)
+def get_content(
+    context: Context, principal: Reader, request: Request, acquisition_id: AcquisitionId, file_id: FileId
+) -> Response:
+    """The file's bytes as they were uploaded; ranges and ETags are understood."""
+    with context.database.session() as session:
+        row = _found(session, acquisition_id, file_id)
+    kind = MEDIA_TYPES.get(PurePosixPath(row.label).suffix) if row.role == "photo" else None
+    return ranged_response(request, context.storage, row.storage_key, kind or "application/octet-stream", row.label)
+
+
+@router.delete("/acquisitions/{acquisition_id}/files/{file_id}", status_code=204)
+def delete_file(context: Context, principal: Uploader, acquisition_id: AcquisitionId, file_id: FileId) -> None:
+    """Delete a file, to send a better one. Not while a job works on the acquisition."""
+    with context.database.session() as session:
+        locked_acquisition(session, acquisition_id)
+        row = _found(session, acquisition_id, file_id)
+        check_idle(session, acquisition_id)
+        forget_part(session, row)
+        session.delete(row)
+        audit(session, principal.key_id, "file.delete", file_id, acquisition=acquisition_id, role=row.role)
+    context.storage.delete(row.storage_key)
+
+
+def _found(session: Session, acquisition_id: str, file_id: str) -> StoredFile:
+    row = session.get(StoredFile, file_id)
+    if row is None or row.acquisition_id != acquisition_id:
+        raise NotFoundError(f"There is no file {file_id} in {acquisition_id}.", advice="GET …/files lists all.")
+    return row

@@ -1,0 +1,160 @@
+"""Acquisitions: what was captured of one specimen, under a pseudonym."""
+
+from __future__ import annotations
+
+import datetime
+from typing import Annotated
+
+import sqlalchemy as sa
+from fastapi import APIRouter, Query
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from sqlalchemy.orm import Session
+
+from specimap_infra.completeness import missing
+from specimap_infra.database import utc_now
+from specimap_infra.errors import JobConflictError
+from specimap_infra.ids import new_id
+from specimap_infra.job_schemas import EdgeMm
+from specimap_infra.tables import FINAL_STATES, Acquisition, Job, StoredFile, Upload
+from specimap_service.acquisitions.capacity import locked_acquisition, no_acquisition
+from specimap_service.acquisitions.deletion import Leftovers
+from specimap_service.acquisitions.schemas import AcquisitionId, Dictionary, FileCounts, counts
+from specimap_service.auth.keys import Admin, Reader, Uploader
+from specimap_service.context import Context, audit
+from specimap_service.paging import After, Limit, Moment, Page, page_of
+from specimap_service.uploads.routes import Files
+
+router = APIRouter(prefix="/v1", tags=["acquisitions"])
+PSEUDONYM = r"^[A-Za-z0-9._-]{1,64}$"
+Pseudonym = Annotated[str, StringConstraints(pattern=PSEUDONYM)]
+
+
+class AcquisitionRequest(BaseModel):
+    """A specimen and how its markers were made."""
+
+    model_config = ConfigDict(
+        extra="forbid", json_schema_extra={"example": {"specimen_id": "SP-2026-0117", "edge_mm": 6.8}}
+    )
+
+    specimen_id: Pseudonym = Field(description="Pseudonym of the specimen: letters, digits, dot, dash, underscore.")
+    accession_number: Pseudonym | None = Field(None, description="Pseudonymous too, for finding it again.")
+    dictionary: Dictionary = Field("DICT_4X4_50", description="ArUco dictionary of the marker cards.")
+    edge_mm: EdgeMm = 6.8
+    notes: Annotated[str, StringConstraints(max_length=2000, pattern=r"^[^\x00]*$")] = Field(
+        "", description="About the capture; no patient's data."
+    )
+
+
+class AcquisitionView(BaseModel):
+    """An acquisition, what has arrived of it, and what is missing."""
+
+    model_config = ConfigDict(title="Acquisition", from_attributes=True)
+
+    id: str
+    specimen_id: str
+    accession_number: str | None
+    dictionary: str
+    edge_mm: float
+    notes: str
+    created_at: datetime.datetime
+    created_by: str = Field(description="The key that made it.")
+    files: FileCounts
+    ready: bool = Field(description="Whether a job can run.")
+    missing: list[str] = Field(description="What is still needed, a sentence each.")
+
+
+@router.post("/acquisitions", status_code=201)
+def create_acquisition(context: Context, principal: Uploader, wanted: AcquisitionRequest) -> AcquisitionView:
+    """Make an acquisition; then upload its photos and its cube."""
+    row = Acquisition(id=new_id("acq"), created_by=principal.key_id, created_at=utc_now(), **wanted.model_dump())
+    with context.database.session() as session:
+        session.add(row)
+        audit(session, principal.key_id, "acquisition.create", row.id)
+        session.flush()
+        view = _view(session, row)
+    context.judge.warm()
+    return view
+
+
+@router.get("/acquisitions")
+def list_acquisitions(
+    context: Context,
+    principal: Reader,
+    specimen_id: Annotated[str | None, Query(max_length=64)] = None,
+    accession_number: Annotated[str | None, Query(max_length=64)] = None,
+    created_after: Annotated[Moment | None, Query(description="Only those made at this time or later.")] = None,
+    created_before: Annotated[Moment | None, Query(description="Only those made before this time.")] = None,
+    after: After = None,
+    limit: Limit = 50,
+) -> Page[AcquisitionView]:
+    """Acquisitions, newest first."""
+    query = sa.select(Acquisition).order_by(Acquisition.id.desc()).limit(limit + 1)
+    for column, value in ((Acquisition.specimen_id, specimen_id), (Acquisition.accession_number, accession_number)):
+        if value is not None:
+            query = query.where(column == value)
+    if created_after is not None:
+        query = query.where(Acquisition.created_at >= created_after)
+    if created_before is not None:
+        query = query.where(Acquisition.created_at < created_before)
+    if after is not None:
+        query = query.where(Acquisition.id < after)
+    with context.database.session() as session:
+        rows = list(session.scalars(query))
+        views = [_view(session, row) for row in rows]
+    return page_of(views, [row.id for row in rows], limit)
+
+
+@router.get("/acquisitions/{acquisition_id}")
+def get_acquisition(context: Context, principal: Reader, acquisition_id: AcquisitionId) -> AcquisitionView:
+    """One acquisition."""
+    with context.database.session() as session:
+        row = session.get(Acquisition, acquisition_id)
+        if row is None:
+            raise no_acquisition(acquisition_id)
+        return _view(session, row)
+
+
+@router.delete("/acquisitions/{acquisition_id}", status_code=204)
+def delete_acquisition(context: Context, principal: Admin, files: Files, acquisition_id: AcquisitionId) -> None:
+    """Delete an acquisition and all that hangs on it: files, jobs, results, labels, exports. It cannot be undone."""
+    with context.database.session() as session:
+        row = locked_acquisition(session, acquisition_id)
+        check_idle(session, acquisition_id)
+        jobs = list(session.scalars(sa.select(Job.id).where(Job.acquisition_id == acquisition_id)))
+        leftovers = Leftovers.of(session, jobs)
+        open_uploads = list(session.scalars(sa.select(Upload.id).where(Upload.acquisition_id == acquisition_id)))
+        session.delete(row)
+        audit(session, principal.key_id, "acquisition.delete", acquisition_id, jobs=jobs)
+    for upload_id in open_uploads:
+        files.remove(upload_id)
+    context.storage.delete(f"acquisitions/{acquisition_id}")
+    leftovers.remove(context)
+
+
+def check_idle(session: Session, acquisition_id: str) -> None:
+    """Raise JobConflictError while a job of the acquisition is queued or running."""
+    busy = session.scalar(
+        sa.select(Job.id).where(Job.acquisition_id == acquisition_id, Job.state.not_in(FINAL_STATES)).limit(1)
+    )
+    if busy is not None:
+        raise JobConflictError(
+            f"Job {busy} works on the acquisition.", advice="Wait for it, or cancel it first.", job_id=busy
+        )
+
+
+def _view(session: Session, row: Acquisition) -> AcquisitionView:
+    stored = session.scalars(sa.select(StoredFile).where(StoredFile.acquisition_id == row.id))
+    lacking = missing(session, row.id)
+    return AcquisitionView(
+        id=row.id,
+        specimen_id=row.specimen_id,
+        accession_number=row.accession_number,
+        dictionary=row.dictionary,
+        edge_mm=row.edge_mm,
+        notes=row.notes,
+        created_at=row.created_at,
+        created_by=row.created_by,
+        files=counts(stored),
+        ready=not lacking,
+        missing=lacking,
+    )

@@ -1,0 +1,164 @@
+"""Files as the API shows them."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Iterable
+from typing import Annotated, Literal
+
+from fastapi import Path
+from pydantic import BaseModel, ConfigDict, Field
+
+from specimap_infra.completeness import DATA, HEADER
+from specimap_infra.tables import StoredFile
+
+Role = Literal["photo", "cube", "white", "dark"]
+Word = Literal["accepted", "doubtful", "refused"]
+AcquisitionId = Annotated[str, Path(pattern=r"^acq_[0-9a-z]{26}$", examples=["acq_01k0000000000000000000000"])]
+FileId = Annotated[str, Path(pattern=r"^file_[0-9a-z]{26}$", examples=["file_01k0000000000000000000000"])]
+Dictionary = Literal[
+    "DICT_4X4_50",
+    "DICT_4X4_100",
+    "DICT_4X4_250",
+    "DICT_4X4_1000",
+    "DICT_5X5_50",
+    "DICT_5X5_100",
+    "DICT_5X5_250",
+    "DICT_5X5_1000",
+    "DICT_6X6_50",
+    "DICT_6X6_100",
+    "DICT_6X6_250",
+    "DICT_6X6_1000",
+    "DICT_7X7_50",
+    "DICT_7X7_100",
+    "DICT_7X7_250",
+    "DICT_7X7_1000",
+    "DICT_ARUCO_ORIGINAL",
+    "DICT_ARUCO_MIP_36h12",
+    "DICT_APRILTAG_16h5",
+    "DICT_APRILTAG_25h9",
+    "DICT_APRILTAG_36h10",
+    "DICT_APRILTAG_36h11",
+]
+"""Those of OpenCV, which the service does not load."""
+
+
+class Remark(BaseModel):
+    """Something about a cube that does not keep it from being used."""
+
+    code: str
+    text: str
+
+
+class Judged(BaseModel):
+    """What every judgement says."""
+
+    verdict: Word = Field(description="`doubtful`: usable, but better retaken. `refused`: no job uses the file.")
+    code: str | None = Field(description="Stable code; docs/errors.md lists all. Null where there is nothing to say.")
+    reason: str = Field(description="What is wrong, in a sentence.")
+    advice: str = Field(description="What to do.")
+
+
+class PhotoJudgement(Judged):
+    """About a photo."""
+
+    kind: Literal["photo"] = "photo"
+    width: int | None = Field(description="Pixels of the upright photo.")
+    height: int | None
+    sharpness: float | None = Field(description="In the least sharp direction; comparable within an acquisition.")
+    marker_ids: list[int] = Field(description="Markers of the acquisition's dictionary that read.")
+    dictionary_seen: str | None = Field(description="Where the markers are of another dictionary: which.")
+    same_as: str | None = Field(None, description="Where the same photo is there already: its label.")
+
+
+class CubeJudgement(Judged):
+    """About a file of a cube or a reference. An ENVI cube's header and data are judged together once both are there."""
+
+    kind: Literal["cube"] = "cube"
+    part: Literal["header", "data", "whole"]
+    waiting_for: Literal["header", "data"] | None = Field(None, description="The other part, while it has not arrived.")
+    rows: int | None = None
+    cols: int | None = None
+    bands: int | None = None
+    interleave: str | None = None
+    dtype: str | None = None
+    quantity: Literal["reflectance", "counts"] | None = None
+    expected_bytes: int | None = Field(None, description="Of the data, as the header says.")
+    found_bytes: int | None = Field(None, description="Of the data, where they are too few.")
+    field: str | None = Field(None, description="The header's field that is wrong.")
+    wavelength_nm: tuple[float, float] | None = Field(None, description="Shortest and longest.")
+    warnings: list[Remark] = []
+
+
+Judgement = Annotated[PhotoJudgement | CubeJudgement, Field(discriminator="kind")]
+
+
+class File(BaseModel):
+    """A file of an acquisition."""
+
+    model_config = ConfigDict(
+        from_attributes=True,
+        json_schema_extra={
+            "example": {
+                "id": "file_01k0000000000000000000000",
+                "role": "photo",
+                "label": "photo-0001.jpg",
+                "name": "IMG_1.jpg",
+                "size": 2481273,
+                "sha256": "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08",
+                "state": "accepted",
+                "created_at": "2026-11-22T09:30:00Z",
+                "judgement": {
+                    "kind": "photo",
+                    "verdict": "doubtful",
+                    "code": "photo_blurred",
+                    "reason": "It is shaken.",
+                    "advice": "Take it again: hold still and tap on the specimen to focus.",
+                    "width": 4000,
+                    "height": 3000,
+                    "sharpness": 0.0021,
+                    "marker_ids": [0, 1, 3],
+                    "dictionary_seen": None,
+                    "same_as": None,
+                },
+            }
+        },
+    )
+
+    id: str
+    role: Role
+    label: str = Field(description="What results call it.")
+    name: str = Field(description="What the client called it; shown, and used for nothing.")
+    size: int = Field(description="Bytes.")
+    sha256: str
+    state: Literal["accepted", "refused"] = Field(description="Refused files take no part in a job.")
+    judgement: Judgement
+    created_at: datetime.datetime
+
+
+class FileCounts(BaseModel):
+    """What has arrived."""
+
+    photos: int = Field(description="Accepted photos.")
+    refused: int = Field(description="Refused files of all roles.")
+    cube: bool = Field(description="Whether the cube is complete.")
+    white: bool
+    dark: bool
+
+
+def counts(files: Iterable[StoredFile]) -> FileCounts:
+    """Count the files of one acquisition."""
+    rows = list(files)
+    accepted = [row for row in rows if row.state == "accepted"]
+
+    def complete(role: Role) -> bool:
+        ends = {row.label.removeprefix(role) for row in accepted if row.role == role}
+        return bool(ends - {HEADER, DATA}) or ends == {HEADER, DATA}
+
+    return FileCounts(
+        photos=sum(row.role == "photo" for row in accepted),
+        refused=len(rows) - len(accepted),
+        cube=complete("cube"),
+        white=complete("white"),
+        dark=complete("dark"),
+    )

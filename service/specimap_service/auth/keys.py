@@ -1,0 +1,188 @@
+"""Who may do what: keys with scopes. A key is ``spk_<id>_<secret>`` in ``Authorization: Bearer``, never in a URL."""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import hmac
+import secrets
+import threading
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import structlog
+from fastapi import Depends, Request
+from fastapi.concurrency import run_in_threadpool
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+
+from specimap_infra.database import Database, utc_now
+from specimap_infra.ids import new_id
+from specimap_infra.tables import SCOPES, ApiKey
+from specimap_service.context import AppContext
+from specimap_service.errors import ForbiddenError, UnauthorizedError
+
+KEPT_SECONDS = 2.0
+"""How long a looked-up key is trusted before the database is asked again: the delay of a revocation."""
+USED_EVERY = datetime.timedelta(minutes=1)
+FAILURES_PER_MINUTE = 60
+"""Wrong keys that one address may present a minute, before it is told to wait."""
+PREFIX = "spk"
+
+
+@dataclass(frozen=True)
+class Principal:
+    """The key that a request came with."""
+
+    key_id: str
+    scopes: frozenset[str]
+    rate_per_minute: int
+    quota_bytes: int
+
+
+def new_key(
+    name: str,
+    scopes: Sequence[str],
+    *,
+    expires_at: datetime.datetime | None = None,
+    rate_per_minute: int | None = None,
+    quota_bytes: int | None = None,
+) -> tuple[ApiKey, str]:
+    """A row to store, and the key itself, which is nowhere kept."""
+    row_id, secret = new_id("key"), secrets.token_hex(32)
+    row = ApiKey(
+        id=row_id,
+        name=name,
+        secret_hash=_hash(secret),
+        scopes=[s for s in SCOPES if s in scopes],
+        created_at=utc_now(),
+        expires_at=expires_at,
+        rate_per_minute=rate_per_minute,
+        quota_bytes=quota_bytes,
+    )
+    return row, f"{PREFIX}_{row_id.removeprefix('key_')}_{secret}"
+
+
+def _hash(secret: str) -> str:
+    # 256 random bits need no slow hash: there is nothing to guess.
+    return hashlib.sha256(secret.encode()).hexdigest()
+
+
+class Keyring:
+    """Keys looked up in the database and trusted for two seconds."""
+
+    def __init__(self, database: Database, rate_per_minute: int, quota_bytes: int) -> None:
+        self._database = database
+        self._defaults = rate_per_minute, quota_bytes
+        self._kept: dict[str, tuple[float, Principal]] = {}
+        self._lock = threading.Lock()
+
+    def principal(self, key: str) -> Principal:
+        """Who a key belongs to.
+
+        Raises:
+            UnauthorizedError: it is unknown, expired or revoked; which of these is not told.
+        """
+        found = self.trusted(key)
+        if found is not None:
+            return found
+        principal = self._look_up(key)
+        with self._lock:
+            if len(self._kept) > 10_000:
+                self._kept.clear()
+            self._kept[_hash(key)] = time.monotonic(), principal
+        return principal
+
+    def trusted(self, key: str) -> Principal | None:
+        """Who a key belongs to, if it was looked up a moment ago; asks no database."""
+        with self._lock:
+            found = self._kept.get(_hash(key))
+        return found[1] if found is not None and time.monotonic() - found[0] < KEPT_SECONDS else None
+
+    def forget(self) -> None:
+        """Trust nothing that was looked up before."""
+        with self._lock:
+            self._kept.clear()
+
+    def _look_up(self, key: str) -> Principal:
+        prefix, _, rest = key.partition("_")
+        name, _, secret = rest.partition("_")
+        with self._database.session() as session:
+            row = session.get(ApiKey, f"key_{name}") if prefix == PREFIX else None
+            # Compared even where there is no such key, so that the time taken says nothing.
+            same = hmac.compare_digest(_hash(secret), row.secret_hash if row else "0" * 64)
+            now = utc_now()
+            if (
+                row is None
+                or not same
+                or row.revoked_at is not None
+                or (row.expires_at is not None and row.expires_at <= now)
+            ):
+                raise UnauthorizedError(
+                    "The key is not valid: unknown, expired or revoked.",
+                    advice="Ask whoever runs the service for a key; `specimap keys create` makes one.",
+                )
+            if row.last_used_at is None or now - row.last_used_at > USED_EVERY:
+                row.last_used_at = now
+            return Principal(
+                row.id,
+                frozenset(row.scopes),
+                row.rate_per_minute or self._defaults[0],
+                row.quota_bytes or self._defaults[1],
+            )
+
+
+PRINCIPAL = "specimap.principal"
+"""Where a request's scope holds its principal, once that is known."""
+
+
+async def authenticated(request: Request) -> Principal:
+    """The principal of a request by its headers alone; one request more of its key's rate.
+
+    Raises:
+        UnauthorizedError: there is no key, or no valid one. RateLimitedError: too many requests, or wrong keys.
+        DatabaseUnavailableError: keys cannot be looked up.
+    """
+    keyring: Keyring = request.app.state.keyring
+    context: AppContext = request.app.state.context
+    kind, _, key = request.headers.get("authorization", "").partition(" ")
+    if kind.lower() != "bearer" or not key.strip():
+        raise UnauthorizedError("There is no key.", advice="Send it as `Authorization: Bearer <key>`.")
+    key = key.strip()
+    try:
+        found = keyring.trusted(key)
+        if found is None:
+            # A thread costs as much as the rest of a short request: it is taken only to ask the database.
+            found = await run_in_threadpool(keyring.principal, key)
+    except UnauthorizedError:
+        address = request.client.host if request.client else "unknown"
+        context.limiter.take(f"address:{address}", FAILURES_PER_MINUTE)
+        raise
+    context.limiter.take(found.key_id, found.rate_per_minute)
+    structlog.contextvars.bind_contextvars(key=found.key_id)
+    return found
+
+
+_bearer = HTTPBearer(auto_error=False, scheme_name="key", description="`Authorization: Bearer spk_…`")
+
+
+def requires(scope: str) -> Callable[..., Awaitable[Principal]]:
+    """A dependency: the request's principal, if its key has the scope. ``admin`` has all."""
+
+    async def principal(
+        request: Request, _: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
+    ) -> Principal:
+        # Known already where the request may have a body: no byte of it is read before.
+        found: Principal = request.scope.get(PRINCIPAL) or await authenticated(request)
+        if scope not in found.scopes and "admin" not in found.scopes:
+            raise ForbiddenError(f"The key lacks the scope {scope!r}.", advice="Use a key that has it.", scope=scope)
+        return found
+
+    return principal
+
+
+Uploader = Annotated[Principal, Depends(requires("upload"))]
+Reader = Annotated[Principal, Depends(requires("read"))]
+Labeller = Annotated[Principal, Depends(requires("label"))]
+Admin = Annotated[Principal, Depends(requires("admin"))]

@@ -1,0 +1,1 @@
+"""Clouds: arrays, spectra, pictures, labels and exports."""

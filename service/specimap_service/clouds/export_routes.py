@@ -1,0 +1,199 @@
+"""Results as files of other programs: made once, by a worker, and kept."""
+
+from __future__ import annotations
+
+import datetime
+from typing import Annotated, Any
+
+import sqlalchemy as sa
+from fastapi import APIRouter, Path, Request, Response
+from pydantic import BaseModel, Field
+
+from specimap_core.errors import NotFoundError
+from specimap_core.export.formats import KINDS, FileFormat, file_name
+from specimap_infra import tables
+from specimap_infra.errors import JobConflictError
+from specimap_infra.ids import new_id
+from specimap_infra.labels import current_labels, fingerprint, lock_cloud
+from specimap_infra.queue import EXPORTS, MAKE_EXPORT, enqueue
+from specimap_infra.tables import PRIORITIES
+from specimap_service.auth.keys import Reader
+from specimap_service.byte_ranges import REVALIDATED, ranged_response
+from specimap_service.clouds.open_clouds import CloudRecord
+from specimap_service.context import AppContext, Context, audit, correlation_id
+
+router = APIRouter(prefix="/v1/clouds/{cloud_id}/exports", tags=["exports"])
+CloudId = Annotated[str, Path(pattern=r"^cloud_[0-9a-z]{26}$")]
+
+
+class Export(BaseModel):
+    """A file made from a result."""
+
+    id: str
+    cloud_id: str
+    format: FileFormat
+    state: str = Field(description="As of a job: queued, running, succeeded, failed.", examples=["succeeded"])
+    size: int | None = Field(description="Bytes, once it is there.")
+    error: dict[str, Any] | None = Field(description="Code, message, advice and details of the failure.")
+    created_at: datetime.datetime
+    links: dict[str, str]
+
+
+@router.post(
+    "/{format}",
+    status_code=202,
+    responses={200: {"model": Export, "description": "It is there."}},
+)
+def create_export(
+    context: Context, principal: Reader, response: Response, cloud_id: CloudId, format: FileFormat
+) -> Export:
+    """Have a file made, once for each format; asked again, tells how far it is.
+
+    One that failed is tried again under a new id. `zarr` holds the label layers; where these have changed since, it is
+    made anew.
+    """
+    cloud = context.clouds.record(cloud_id)
+    response.headers["Location"] = f"/v1/clouds/{cloud_id}/exports/{format.value}"
+    if format is FileFormat.MESH_PLY:
+        response.status_code = 200
+        return _mesh_ply(context, cloud)
+    replaced: str | None = None
+    with context.database.session() as session:
+        lock_cloud(session, cloud_id)
+        row = session.scalar(_query(cloud_id, format))
+        if row is not None and (
+            row.state in ("failed", "cancelled")
+            or (
+                row.state == "succeeded"
+                and format is FileFormat.ZARR
+                and row.labels_hash != fingerprint(current_labels(session, cloud_id))
+            )
+        ):
+            replaced = row.id
+            session.delete(row)
+            session.flush()
+            row = None
+        if row is None:
+            row = tables.Export(
+                id=new_id("exp"),
+                cloud_id=cloud_id,
+                format=format.value,
+                state="queued",
+                correlation_id=correlation_id(),
+                created_by=principal.key_id,
+            )
+            session.add(row)
+            session.flush()
+            priority = PRIORITIES["routine"]
+            enqueue(context.queue, session.connection(), EXPORTS, MAKE_EXPORT, row.id, priority)
+            audit(session, principal.key_id, "export.create", row.id, cloud=cloud_id, format=format.value)
+    if replaced is not None:
+        context.storage.delete(f"exports/{replaced}")
+    response.status_code = 200 if row.state == "succeeded" else 202
+    return _shown(row)
+
+
+@router.get("")
+def list_exports(context: Context, principal: Reader, cloud_id: CloudId) -> list[Export]:
+    """The files that are there or under way; `mesh-ply` always is."""
+    cloud = context.clouds.record(cloud_id)
+    query = sa.select(tables.Export).where(tables.Export.cloud_id == cloud_id).order_by(tables.Export.id.desc())
+    with context.database.session() as session:
+        rows = list(session.scalars(query))
+    return [*map(_shown, rows), _mesh_ply(context, cloud)]
+
+
+@router.get("/{format}")
+def get_export(context: Context, principal: Reader, cloud_id: CloudId, format: FileFormat) -> Export:
+    """How far a file is."""
+    cloud = context.clouds.record(cloud_id)
+    return _mesh_ply(context, cloud) if format is FileFormat.MESH_PLY else _shown(_found(context, cloud_id, format))
+
+
+FILE: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "The file.",
+        "content": {
+            media: {"schema": {"type": "string", "format": "binary"}}
+            for media in sorted({kind.media_type for kind in KINDS.values()})
+        },
+    },
+    206: {"description": "The range of it that was asked for."},
+    304: {"description": "The client has it."},
+    412: {"description": "It is not the one that If-Match names."},
+    416: {"description": "The range lies outside."},
+}
+
+
+@router.head("/{format}/content", response_class=Response, responses=FILE, operation_id="head_export_content")
+@router.get("/{format}/content", response_class=Response, responses=FILE)
+def get_content(
+    context: Context, principal: Reader, request: Request, cloud_id: CloudId, format: FileFormat
+) -> Response:
+    """The file itself; single byte ranges, so that a broken download goes on."""
+    cloud = context.clouds.record(cloud_id)
+    if format is FileFormat.MESH_PLY:
+        key: str | None = _mesh_key(cloud)
+    else:
+        row = _found(context, cloud_id, format)
+        key = row.storage_key if row.state == "succeeded" else None
+        if key is None:
+            raise JobConflictError(
+                f"The export is {row.state}.",
+                advice="GET the export until it has succeeded; POST tries a failed one again.",
+                state=row.state,
+            )
+    kind = KINDS[format]
+    return ranged_response(
+        request, context.storage, key or "", kind.media_type, file_name(cloud_id, format), cache=REVALIDATED
+    )
+
+
+def _query(cloud_id: str, format: FileFormat) -> sa.Select[tables.Export]:
+    return sa.select(tables.Export).where(tables.Export.cloud_id == cloud_id, tables.Export.format == format.value)
+
+
+def _found(context: AppContext, cloud_id: str, format: FileFormat) -> tables.Export:
+    with context.database.session() as session:
+        row = session.scalar(_query(cloud_id, format))
+    if row is None:
+        raise NotFoundError(
+            f"There is no export of {cloud_id} as {format.value}.", advice="POST to the same address has it made."
+        )
+    return row
+
+
+def _mesh_key(cloud: CloudRecord) -> str:
+    return f"{cloud.prefix}/mesh.ply"
+
+
+def _mesh_ply(context: AppContext, cloud: CloudRecord) -> Export:
+    """The mesh as the run left it: an export that needs no row."""
+    return Export(
+        id=cloud.id.replace("cloud_", "exp_"),
+        cloud_id=cloud.id,
+        format=FileFormat.MESH_PLY,
+        state="succeeded",
+        size=context.storage.stat(_mesh_key(cloud)).size,
+        error=None,
+        created_at=cloud.created_at,
+        links=_links(cloud.id, FileFormat.MESH_PLY),
+    )
+
+
+def _shown(row: tables.Export) -> Export:
+    return Export(
+        id=row.id,
+        cloud_id=row.cloud_id,
+        format=FileFormat(row.format),
+        state=row.state,
+        size=row.size,
+        error=row.error,
+        created_at=row.created_at,
+        links=_links(row.cloud_id, FileFormat(row.format)),
+    )
+
+
+def _links(cloud_id: str, format: FileFormat) -> dict[str, str]:
+    own = f"/v1/clouds/{cloud_id}/exports/{format.value}"
+    return {"self": own, "content": f"{own}/content"}

@@ -1,0 +1,268 @@
+"""Label layers: written back by classifiers and people, versioned, read as arrays."""
+
+from __future__ import annotations
+
+import datetime
+import io
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path as FilePath
+from typing import Annotated, Any
+from uuid import uuid4
+
+import numpy as np
+import sqlalchemy as sa
+from anyio import to_thread
+from fastapi import APIRouter, Header, Path, Query, Request, Response
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.concurrency import run_in_threadpool
+from starlette.responses import StreamingResponse
+
+from specimap_core.atomic import disk_errors, remove
+from specimap_core.cloud.shards import PointArray
+from specimap_infra.labels import current_labels
+from specimap_infra.tables import LabelVersion
+from specimap_service.array_responses import ARROW, JSON, NPY, arrow_answer, chosen_type, documented, json_answer
+from specimap_service.auth.keys import Labeller, Reader
+from specimap_service.clouds.label_body import (
+    EXAMPLE_TEXT,
+    HEADER,
+    LabelClass,
+    LabelMetadata,
+    MadeBy,
+    most_bytes,
+    parse_metadata,
+    parse_values,
+)
+from specimap_service.clouds.label_store import Conditions, delete_label, find_label, no_label, put_label
+from specimap_service.clouds.open_clouds import LabelRecord
+from specimap_service.context import AppContext, Context
+from specimap_service.errors import MediaTypeError, PayloadTooLargeError
+
+router = APIRouter(prefix="/v1", tags=["labels"])
+CloudId = Annotated[str, Path(pattern=r"^cloud_[0-9a-z]{26}$")]
+LabelName = Annotated[str, Path(pattern=r"^[a-z0-9_-]{1,64}$")]
+Version = Annotated[int | None, Query(ge=1, le=10**9, description="By default the current version.")]
+_BLOCK = 65536
+_SENT_TOGETHER = 1024 * 1024
+
+
+class Label(BaseModel):
+    """A version of a label layer."""
+
+    model_config = ConfigDict(from_attributes=True)
+
+    cloud_id: str
+    name: str
+    version: int
+    kind: str
+    classes: list[LabelClass]
+    made_by: MadeBy
+    sha256: str = Field(description="Of values and metadata: the same content has the same one.")
+    created_at: datetime.datetime
+    created_by: str
+    links: dict[str, str]
+
+
+class LabelValues(BaseModel):
+    """The values of a layer, in the order of the cloud's points."""
+
+    cloud_id: str
+    name: str
+    version: int
+    kind: str
+    classes: list[LabelClass]
+    values: list[int] | list[float | None] | list[list[float | None]] = Field(
+        description="One a point; of probabilities of several classes a list a point, in the order of the classes."
+    )
+
+
+BINARY = {"schema": {"type": "string", "format": "binary"}}
+
+
+@router.put(
+    "/clouds/{cloud_id}/labels/{name}",
+    status_code=201,
+    responses={200: {"model": Label, "description": "The current version is the same; nothing has changed."}},
+    openapi_extra={"requestBody": {"required": True, "content": {ARROW: BINARY, NPY: BINARY}}},
+)
+async def put(
+    context: Context,
+    principal: Labeller,
+    request: Request,
+    response: Response,
+    cloud_id: CloudId,
+    name: LabelName,
+    label: Annotated[
+        str | None,
+        Header(alias=HEADER, description="Kind, classes and made_by as JSON. Required.", examples=[EXAMPLE_TEXT]),
+    ] = None,
+    if_match: Annotated[str | None, Header(description='The version to replace, as `"3"`; `*`: any.')] = None,
+    if_none_match: Annotated[str | None, Header(description="`*`: only where there is no such layer.")] = None,
+) -> Label:
+    """Store a layer's next version, in the order of the cloud's points.
+
+    An Arrow stream holds one column `value`, or for probabilities of several classes one column a class, named as
+    the class; it is not compressed. A npy file holds (S,), or (S, C) in the order of `classes`. Kind `class`: whole
+    numbers, each that of a class; name a class for unlabelled points too. Kind `probability`: 0 to 1; NaN or null
+    says nothing of a point.
+    """
+    metadata, conditions = parse_metadata(label), Conditions.of(if_match, if_none_match)
+    media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if media not in (ARROW, NPY):
+        raise MediaTypeError(f"{HEADER} comes with an array.", advice=f"Send {ARROW} or {NPY}.", offered=[ARROW, NPY])
+    points = (await run_in_threadpool(context.clouds.record, cloud_id)).points
+    scratch = context.settings.scratch / f"label-{uuid4().hex}.body.tmp"
+    try:
+        await _receive(request, scratch, most_bytes(metadata, points))
+
+        def store() -> tuple[LabelVersion, bool]:
+            values = parse_values(scratch, media == ARROW, metadata, points)
+            return put_label(context, principal, cloud_id, name, metadata, values, conditions)
+
+        row, new = await run_in_threadpool(store)
+    finally:
+        await run_in_threadpool(remove, scratch)
+    response.status_code = 201 if new else 200
+    response.headers["ETag"] = f'"{row.version}"'
+    response.headers["Location"] = f"/v1/clouds/{cloud_id}/labels/{name}?version={row.version}"
+    return _shown(row)
+
+
+async def _receive(request: Request, target: FilePath, limit: int) -> None:
+    """Write the body to a file. Raises PayloadTooLargeError, StorageFullError."""
+    too_large = PayloadTooLargeError(
+        "The body is larger than these labels can be.", advice="Send a value for each point.", limit_bytes=limit
+    )
+    length = request.headers.get("content-length", "")
+    if length.isdecimal() and int(length) > limit:
+        raise too_large
+    size, pieces = 0, bytearray()
+    with disk_errors(target):
+        async for piece in request.stream():
+            size += len(piece)
+            if size > limit:
+                raise too_large
+            pieces += piece
+            if len(pieces) >= _SENT_TOGETHER:
+                await to_thread.run_sync(partial(_append, target, bytes(pieces)))
+                pieces.clear()
+        await to_thread.run_sync(partial(_append, target, bytes(pieces)))
+
+
+def _append(target: FilePath, data: bytes) -> None:
+    with open(target, "ab") as file:
+        file.write(data)
+
+
+@router.get("/clouds/{cloud_id}/labels")
+def list_labels(context: Context, principal: Reader, cloud_id: CloudId) -> list[Label]:
+    """The current version of each layer, by name."""
+    context.clouds.record(cloud_id)
+    with context.database.session() as session:
+        return [_shown(row) for row in current_labels(session, cloud_id)]
+
+
+@router.get("/clouds/{cloud_id}/labels/{name}")
+def get_label(
+    context: Context, principal: Reader, response: Response, cloud_id: CloudId, name: LabelName, version: Version = None
+) -> Label:
+    """A layer's metadata; its ETag is the version, for If-Match."""
+    row = _find(context, cloud_id, name, version)
+    response.headers["ETag"] = f'"{row.version}"'
+    return _shown(row)
+
+
+@router.get("/clouds/{cloud_id}/labels/{name}/versions")
+def list_versions(context: Context, principal: Reader, cloud_id: CloudId, name: LabelName) -> list[Label]:
+    """All versions of a layer, newest first."""
+    context.clouds.record(cloud_id)
+    query = sa.select(LabelVersion).where(LabelVersion.cloud_id == cloud_id, LabelVersion.name == name)
+    with context.database.session() as session:
+        rows = list(session.scalars(query.order_by(LabelVersion.version.desc())))
+    if not rows:
+        raise no_label(cloud_id, name)
+    return [_shown(row) for row in rows]
+
+
+@router.get("/clouds/{cloud_id}/labels/{name}/values", response_model=None, responses=documented(LabelValues))
+def get_values(
+    context: Context, principal: Reader, request: Request, cloud_id: CloudId, name: LabelName, version: Version = None
+) -> Response:
+    """A layer's values in the order of the cloud's points, in the forms that PUT takes, or as JSON."""
+    media = chosen_type(request)
+    row = _find(context, cloud_id, name, version)
+    headers = {"X-Specimap-Label-Version": str(row.version)}
+    record = LabelRecord(row.name, row.version, row.kind, row.storage_prefix)
+    with context.clouds.reading(cloud_id):
+        array = context.clouds.label_array(record)
+        if media == NPY:
+            return _npy(array, headers)
+        if media == ARROW:
+            names = [item["name"] for item in row.classes] if len(array.shape) == 2 else ["value"]
+            described = {"kind": row.kind, "version": str(row.version)}
+
+            def columns(start: int, stop: int) -> dict[str, np.ndarray[Any, Any]]:
+                values = array.read(start, stop).reshape(stop - start, -1)
+                return {name: np.ascontiguousarray(values[:, i]) for i, name in enumerate(names)}
+
+            return arrow_answer(array.shape[0], columns, described, headers)
+        assert media == JSON
+        shown = {
+            "cloud_id": cloud_id,
+            "name": name,
+            "version": row.version,
+            "kind": row.kind,
+            "classes": row.classes,
+            "values": array.read(0, array.shape[0]),
+        }
+        return json_answer(shown, headers)
+
+
+def _npy(array: PointArray, headers: dict[str, str]) -> Response:
+    head = io.BytesIO()
+    dtype = array.dtype.newbyteorder("<")
+    np.lib.format.write_array_header_1_0(head, {"descr": dtype.str, "fortran_order": False, "shape": array.shape})
+    length = len(head.getvalue()) + dtype.itemsize * int(np.prod(array.shape))
+
+    def pieces() -> Iterator[bytes]:
+        yield head.getvalue()
+        for start in range(0, array.shape[0], _BLOCK):
+            yield np.ascontiguousarray(array.read(start, min(start + _BLOCK, array.shape[0])), dtype).tobytes()
+
+    return StreamingResponse(pieces(), headers={**headers, "Content-Length": str(length)}, media_type=NPY)
+
+
+@router.delete("/clouds/{cloud_id}/labels/{name}", status_code=204)
+def delete(context: Context, principal: Labeller, cloud_id: CloudId, name: LabelName) -> None:
+    """Delete a layer with all its versions."""
+    delete_label(context, principal, cloud_id, name)
+
+
+def _find(context: AppContext, cloud_id: str, name: str, version: int | None) -> LabelVersion:
+    context.clouds.record(cloud_id)
+    with context.database.session() as session:
+        return find_label(session, cloud_id, name, version)
+
+
+def _shown(row: LabelVersion) -> Label:
+    base = f"/v1/clouds/{row.cloud_id}"
+    own = f"{base}/labels/{row.name}"
+    metadata = LabelMetadata(kind=row.kind, classes=row.classes, made_by=row.made_by)  # type: ignore[arg-type]
+    return Label(
+        cloud_id=row.cloud_id,
+        name=row.name,
+        version=row.version,
+        kind=row.kind,
+        classes=metadata.classes,
+        made_by=metadata.made_by,
+        sha256=row.sha256,
+        created_at=row.created_at,
+        created_by=row.created_by,
+        links={
+            "self": f"{own}?version={row.version}",
+            "values": f"{own}/values?version={row.version}",
+            "preview": f"{base}/previews/label.png?name={row.name}&version={row.version}",
+            "zarr": f"{base}/zarr/labels/{row.name}",
+        },
+    )

@@ -1,0 +1,58 @@
+"""Pictures that were drawn, kept in memory up to a number of bytes."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+
+from specimap_service.clouds.pictures import Picture
+
+MOST_BYTES = 128 * 1024**2
+DRAWN_AT_ONCE = 2
+"""Pictures drawn side by side: each takes up to some hundred megabytes while it is."""
+
+
+class PictureCache:
+    """Pictures by tag, least recently used ones dropped first. Safe to share between threads."""
+
+    def __init__(self, most_bytes: int = MOST_BYTES) -> None:
+        self._most = most_bytes
+        self._kept: OrderedDict[str, Picture] = OrderedDict()
+        self._bytes = 0
+        self._lock = threading.Lock()
+        self._drawing = threading.BoundedSemaphore(DRAWN_AT_ONCE)
+
+    def get(self, tag: str, draw: Callable[[], Picture]) -> Picture:
+        """The picture of that tag, drawn if it is not there."""
+        found = self._find(tag)
+        if found is not None:
+            return found
+        with self._drawing:
+            # Another request may have drawn it while this one waited.
+            found = self._find(tag)
+            if found is None:
+                found = draw()
+                self._keep(tag, found)
+        return found
+
+    @property
+    def kept_bytes(self) -> int:
+        """What the pictures take."""
+        return self._bytes
+
+    def _find(self, tag: str) -> Picture | None:
+        with self._lock:
+            found = self._kept.get(tag)
+            if found is not None:
+                self._kept.move_to_end(tag)
+            return found
+
+    def _keep(self, tag: str, picture: Picture) -> None:
+        with self._lock:
+            if tag not in self._kept:
+                self._kept[tag] = picture
+                self._bytes += len(picture.png)
+            while self._bytes > self._most:
+                _, dropped = self._kept.popitem(last=False)
+                self._bytes -= len(dropped.png)

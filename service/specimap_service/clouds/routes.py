@@ -1,0 +1,105 @@
+"""``/v1/clouds``: what results there are."""
+
+from __future__ import annotations
+
+import datetime
+from typing import Annotated
+
+import numpy as np
+import sqlalchemy as sa
+from fastapi import APIRouter, Path, Query, Request, Response
+from pydantic import BaseModel, ConfigDict, Field
+
+from specimap_infra.tables import Acquisition, CloudRow, Job
+from specimap_service.auth.keys import Reader
+from specimap_service.byte_ranges import ranged_response
+from specimap_service.context import Context
+from specimap_service.paging import After, Limit, Page, page_of
+
+router = APIRouter(prefix="/v1", tags=["clouds"])
+CloudId = Annotated[str, Path(pattern=r"^cloud_[0-9a-hjkmnp-tv-z]{26}$")]
+
+
+class CloudSummary(BaseModel):
+    """A finished cloud."""
+
+    model_config = ConfigDict(from_attributes=True)
+
+    id: str
+    job_id: str
+    acquisition_id: str
+    points: int
+    bands: int
+    size: int = Field(description="Bytes of the whole result as stored.")
+    created_at: datetime.datetime
+
+
+class CloudAnswer(CloudSummary):
+    """A finished cloud, with what its arrays' metadata say and where the rest is."""
+
+    quantity: str = Field(description="What decoded spectra are: `reflectance`, or `counts`.")
+    wavelength_nm: list[float | None] = Field(description="One a band; null where unknown.")
+    bad_bands: list[int] = Field(description="Bands that the cube's file or its noise declared useless.")
+    low: list[float] = Field(description="Least x, y, z of the points, mm, marker frame.")
+    high: list[float]
+    labels: list[str]
+    links: dict[str, str]
+
+
+@router.get("/clouds")
+def list_clouds(
+    context: Context,
+    principal: Reader,
+    acquisition_id: Annotated[str | None, Query(max_length=64)] = None,
+    specimen_id: Annotated[str | None, Query(max_length=200)] = None,
+    after: After = None,
+    limit: Limit = 100,
+) -> Page[CloudSummary]:
+    """All finished clouds, newest first."""
+    query = sa.select(CloudRow).join(Job, Job.id == CloudRow.job_id).where(Job.state == "succeeded")
+    if acquisition_id is not None:
+        query = query.where(CloudRow.acquisition_id == acquisition_id)
+    if specimen_id is not None:
+        query = query.join(Acquisition, Acquisition.id == CloudRow.acquisition_id)
+        query = query.where(Acquisition.specimen_id == specimen_id)
+    if after is not None:
+        query = query.where(CloudRow.id < after)
+    query = query.order_by(CloudRow.id.desc()).limit(limit + 1).options(sa.orm.defer(CloudRow.report))
+    with context.database.session() as session:
+        rows = list(session.scalars(query))
+    return page_of([CloudSummary.model_validate(row) for row in rows], [row.id for row in rows], limit)
+
+
+@router.get("/clouds/{cloud_id}")
+def show_cloud(context: Context, principal: Reader, cloud_id: CloudId) -> CloudAnswer:
+    """One cloud."""
+    with context.clouds.reading(cloud_id) as (record, cloud):
+        boxes, here = cloud.chunk_aabb, f"/v1/clouds/{cloud_id}"
+        return CloudAnswer(
+            **CloudSummary.model_validate(record).model_dump(),
+            quantity=cloud.quantity,
+            wavelength_nm=[float(nm) if np.isfinite(nm) else None for nm in cloud.wavelengths_nm],
+            bad_bands=np.flatnonzero(cloud.bad_bands).tolist(),
+            low=boxes[:, :3].min(0).tolist(),
+            high=boxes[:, 3:].max(0).tolist(),
+            labels=list(record.labels),
+            links={
+                "report": f"/v1/jobs/{record.job_id}/report",
+                "zarr": f"{here}/zarr",
+                "spectra": f"{here}/spectra",
+                "previews": f"{here}/previews/rgb.png",
+                "labels": f"{here}/labels",
+                "exports": f"{here}/exports",
+                "mesh": f"{here}/exports/mesh-ply",
+                "corners": f"{here}/corners",
+            },
+        )
+
+
+@router.get(
+    "/clouds/{cloud_id}/corners", response_class=Response, responses={200: {"content": {"application/json": {}}}}
+)
+def get_corners(context: Context, principal: Reader, request: Request, cloud_id: CloudId) -> Response:
+    """The markers' corners: `{"<id>": [[x, y, z] * 4]}`, mm, in the marker frame."""
+    record = context.clouds.record(cloud_id)
+    return ranged_response(request, context.storage, f"{record.prefix}/corners.json", "application/json")

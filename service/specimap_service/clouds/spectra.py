@@ -1,0 +1,297 @@
+"""Which points and bands a request means, and what is told of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+
+from specimap_core.cloud import Cloud, Flag
+from specimap_core.geometry.cameras import Array
+from specimap_service.array_responses import Columns
+from specimap_service.errors import RequestInvalidError
+
+MOST_POINTS = 100_000
+"""Points of one page."""
+MOST_JSON_POINTS = 10_000
+PAGE, JSON_PAGE = 10_000, 2_000
+"""Points of a page where the request does not say."""
+MOST_VERTICES = 10_000
+
+FieldName = Literal["xyz", "normal", "rgb", "hsi_pixel", "sigma_mm", "flags", "distance_mm"]
+Place = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+_Pixel = Annotated[int, Field(ge=0, le=65535)]
+_Coordinate = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+_Number = Annotated[int, Field(ge=0, lt=2**32)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class _OneOf(_Strict):
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        given = [name for name in type(self).model_fields if getattr(self, name) is not None]
+        if len(given) != 1:
+            names = ", ".join(type(self).model_fields)
+            raise ValueError(f"give exactly one of {names}; this gives {', '.join(given) or 'none'}")
+        return self
+
+
+class Nearest(_Strict):
+    """The ``k`` points nearest to a place, nearest first."""
+
+    xyz: Place = Field(description="mm, marker frame.")
+    k: int = Field(default=1, ge=1, le=MOST_POINTS)
+
+
+class Box(_Strict):
+    """All points in a box, borders included."""
+
+    low: Place = Field(description="mm, marker frame.")
+    high: Place
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if any(a > b for a, b in zip(self.low, self.high, strict=True)):
+            raise ValueError("low is at most high on each axis")
+        return self
+
+
+class Radius(_Strict):
+    """All points at most this far from a place."""
+
+    centre: Place = Field(description="mm, marker frame.")
+    radius_mm: float = Field(ge=0, allow_inf_nan=False)
+
+
+class Select(_OneOf):
+    """Which points: exactly one of these."""
+
+    indices: list[_Number] | None = Field(
+        default=None,
+        min_length=1,
+        max_length=MOST_POINTS,
+        fail_fast=True,
+        description="Points by number, in this order.",
+    )
+    pixels: list[tuple[_Pixel, _Pixel]] | None = Field(
+        default=None,
+        min_length=1,
+        max_length=MOST_POINTS,
+        fail_fast=True,
+        description="Points by row and column of the cube, in this order; a pixel without a point is left out.",
+    )
+    polygon: list[tuple[_Coordinate, _Coordinate]] | None = Field(
+        default=None,
+        min_length=3,
+        max_length=MOST_VERTICES,
+        fail_fast=True,
+        description="Points whose pixel's centre lies in the closed polygon of (row, column); even-odd rule.",
+    )
+    nearest: Nearest | None = None
+    box: Box | None = None
+    radius: Radius | None = None
+
+
+class Bands(_OneOf):
+    """Which bands: exactly one of these."""
+
+    nm: tuple[FiniteFloat, FiniteFloat] | None = Field(
+        default=None, description="Bands from the first to the second wavelength, both included."
+    )
+    indices: list[_Number] | None = Field(
+        default=None, min_length=1, max_length=65536, fail_fast=True, description="Bands by number, in this order."
+    )
+
+
+class SpectraRequest(_Strict):
+    """Points, bands, and what else is wanted of the points."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "example": {
+                "select": {"radius": {"centre": [3.5, -2.0, 4.1], "radius_mm": 1.5}},
+                "bands": {"nm": [500, 700]},
+                "fields": ["xyz", "distance_mm"],
+            }
+        },
+    )
+
+    select: Select
+    bands: Bands | None = Field(default=None, description="All bands where absent.")
+    fields: list[FieldName] = Field(
+        default_factory=list,
+        max_length=7,
+        description="Columns beside index and spectrum; `distance_mm` goes with `nearest` and `radius`.",
+    )
+    limit: int | None = Field(
+        default=None,
+        ge=1,
+        le=MOST_POINTS,
+        description=f"Most points; {PAGE} where absent, in JSON {JSON_PAGE} and never more than {MOST_JSON_POINTS}.",
+    )
+    offset: int = Field(default=0, ge=0, le=2**32, description="Points of the selection to leave out before.")
+
+    @model_validator(mode="after")
+    def _measurable(self) -> Self:
+        if "distance_mm" in self.fields and self.select.nearest is None and self.select.radius is None:
+            raise ValueError("distance_mm goes with the selections nearest and radius")
+        return self
+
+
+class SpectraAnswer(BaseModel):
+    """One page of a selection. ``indices``, ``spectra`` and ``fields`` have one entry a point."""
+
+    total: int = Field(description="Points of the whole selection.")
+    offset: int
+    next_offset: int | None = Field(description="`offset` of the next page; null on the last one.")
+    quantity: str = Field(description="What the values are: `reflectance`, or `counts`.")
+    bands: list[int]
+    wavelength_nm: list[float | None]
+    indices: list[int]
+    spectra: list[list[float | None]] = Field(description="Null where a point has no value; NaN in Arrow and NumPy.")
+    fields: dict[str, list[float | int | list[float | int] | None]]
+
+
+class Point(BaseModel):
+    """All that is known of one point."""
+
+    index: int
+    xyz: list[float] = Field(description="mm, marker frame.")
+    normal: list[float]
+    rgb: list[int]
+    hsi_pixel: list[int] = Field(description="Row, column in the cube.")
+    sigma_mm: float | None = Field(description="One standard deviation of the position.")
+    flags: int
+    flag_names: list[str]
+    labels: dict[str, float | int | list[float | None] | None] = Field(description="By label: its value here.")
+    quantity: str = Field(description="What the spectrum is: `reflectance`, or `counts`.")
+    bands: list[int]
+    wavelength_nm: list[float | None]
+    spectrum: list[float | None] = Field(description="Null where it has no value.")
+
+
+class BandAnswer(BaseModel):
+    """One band of all points, in their order."""
+
+    band: int
+    wavelength_nm: float | None
+    quantity: str
+    values: list[float | None] = Field(description="Null where a point has no value; NaN in Arrow and NumPy.")
+
+
+# ---- what a request means -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Selection:
+    """``indices`` (n,) of the points asked for, ``centre`` (3,) mm of what ``distance_mm`` is measured from."""
+
+    indices: NDArray[np.intp]
+    centre: Place | None = None
+
+
+def selected(cloud: Cloud, select: Select) -> Selection:
+    """The points that are meant.
+
+    Raises:
+        RequestInvalidError: there is no such point.
+    """
+    if select.indices is not None:
+        return Selection(_inside(select.indices, cloud.n_points, "point"))
+    if select.pixels is not None:
+        found = cloud.at_pixels(np.array(select.pixels))
+        return Selection(found[found >= 0])
+    if select.polygon is not None:
+        return Selection(cloud.in_polygon(select.polygon))
+    if select.nearest is not None:
+        return Selection(cloud.nearest(select.nearest.xyz, select.nearest.k)[0], select.nearest.xyz)
+    if select.box is not None:
+        return Selection(cloud.in_box(select.box.low, select.box.high))
+    assert select.radius is not None
+    return Selection(cloud.in_radius(select.radius.centre, select.radius.radius_mm), select.radius.centre)
+
+
+def band_numbers(cloud: Cloud, bands: Bands | None) -> NDArray[np.intp] | None:
+    """The bands that are meant; None for all.
+
+    Raises:
+        RequestInvalidError: there is no such band.
+    """
+    if bands is None:
+        return None
+    if bands.indices is not None:
+        return _inside(bands.indices, cloud.bands, "band")
+    assert bands.nm is not None
+    low, high = bands.nm
+    # Unknown wavelengths are NaN, which lies in no range.
+    found = np.flatnonzero((cloud.wavelengths_nm >= low) & (cloud.wavelengths_nm <= high))
+    if not len(found):
+        known = cloud.wavelengths_nm[np.isfinite(cloud.wavelengths_nm)]
+        span = f"from {known.min():g} to {known.max():g} nm" if len(known) else "of unknown wavelength"
+        raise RequestInvalidError(
+            f"No band lies between {low:g} and {high:g} nm; the cloud's are {span}.",
+            advice="Give a range that holds a band, or bands by number.",
+        )
+    return found
+
+
+def listed_bands(text: str | None) -> Bands | None:
+    """Bands from the query: ``0,5,10-20``. Its form has been checked."""
+    if text is None:
+        return None
+    numbers: list[int] = []
+    for part in text.split(","):
+        first, _, last = part.partition("-")
+        wanted = range(int(first), int(last or first) + 1)
+        if not wanted or len(numbers) + len(wanted) > 65536:
+            raise RequestInvalidError(
+                "query.bands: a range is empty, or there are too many.", advice="Give numbers as in 0,5,10-20."
+            )
+        numbers += wanted
+    return Bands(indices=numbers)
+
+
+def _inside(numbers: list[int], limit: int, what: str) -> NDArray[np.intp]:
+    found = np.array(numbers, np.intp)
+    if found.max() >= limit:
+        raise RequestInvalidError(
+            f"There is no {what} {found.max()}: the cloud has {limit}.",
+            advice=f"Give numbers from 0 to {limit - 1}.",
+            limit=limit,
+        )
+    return found
+
+
+# ---- what is told -------------------------------------------------------------------------------------
+
+
+def field_values(cloud: Cloud, selection: Selection, name: FieldName, part: slice) -> Array:
+    """Values (n,) or (n, m) of a field for a part of the selected points."""
+    points = selection.indices[part]
+    if name != "distance_mm":
+        return np.asarray(getattr(cloud, name)[points])
+    return np.asarray(np.linalg.norm(cloud.xyz[points] - np.asarray(selection.centre), axis=1), np.float32)
+
+
+def columns_of(
+    cloud: Cloud, selection: Selection, bands: NDArray[np.intp] | None, fields: list[FieldName], part: slice
+) -> Columns:
+    """Columns of an Arrow stream: index, the fields, spectrum."""
+    points = selection.indices[part]
+    return {
+        "index": points.astype(np.uint32),
+        **{name: field_values(cloud, selection, name, part) for name in fields},
+        "spectrum": cloud.spectra(points, bands),
+    }
+
+
+def flag_names(flags: int) -> list[str]:
+    """Names of the bits that are set."""
+    return [flag.name.lower() for flag in Flag if flag.name and flags & flag]

@@ -1,0 +1,101 @@
+"""``/v1/clouds/{id}/zarr``: a cloud as a Zarr v3 group that any Zarr client reads."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Request
+from starlette.responses import Response
+
+from specimap_core.cloud import ARRAYS
+from specimap_core.cloud.shards import damage
+from specimap_core.cloud.source import ByteSource
+from specimap_core.errors import NotFoundError
+from specimap_core.json_text import json_text
+from specimap_infra.storage import Storage
+from specimap_service.auth.keys import Reader
+from specimap_service.byte_ranges import CACHED, REVALIDATED, ranged_bytes, ranged_response
+from specimap_service.clouds.open_clouds import CloudRecord, StoredFolder
+from specimap_service.clouds.routes import CloudId
+from specimap_service.context import Context
+
+router = APIRouter(prefix="/v1", tags=["zarr"])
+DOCUMENT = "zarr.json"
+GROUP: dict[str, Any] = {"zarr_format": 3, "node_type": "group", "attributes": {}}
+JSON, BYTES = "application/json", "application/octet-stream"
+_FILE = {"schema": {"type": "string", "format": "binary"}}
+_ANSWERS: dict[int | str, dict[str, Any]] = {
+    200: {"description": "The file", "content": {BYTES: _FILE, JSON: {"schema": {"type": "object"}}}},
+    206: {"description": "The byte range", "content": {BYTES: _FILE}},
+    304: {"description": "The client has it"},
+}
+
+
+@router.head(
+    "/clouds/{cloud_id}/zarr/{key:path}", response_class=Response, responses=_ANSWERS, operation_id="head_zarr_file"
+)
+@router.get("/clouds/{cloud_id}/zarr/{key:path}", response_class=Response, responses=_ANSWERS)
+def zarr_file(
+    context: Context,
+    principal: Reader,
+    request: Request,
+    cloud_id: CloudId,
+    key: Annotated[str, Path(description="As in the group: `zarr.json`, `spectra/c/0/0`, `labels/tissue/zarr.json`.")],
+) -> Response:
+    """A file of the group, as stored; single byte ranges, ETags.
+
+    Two documents are made when asked for, so that clients find the arrays without listing files: `zarr.json` with
+    consolidated metadata, the labels among them, and `labels/zarr.json` with those of the labels. Labels appear as
+    `labels/<name>`, in their current version.
+    """
+    record = context.clouds.record(cloud_id)
+    # Every key is made of characters that need no escape: what comes escaped is none, whatever it decodes to.
+    if b"%" in request.scope.get("raw_path", b""):
+        raise _no_such(key)
+    if key in (DOCUMENT, f"labels/{DOCUMENT}"):
+        with context.clouds.reading(cloud_id) as (record, _):
+            return ranged_bytes(request, _group_document(context.storage, record, labels=key != DOCUMENT), JSON)
+    array, _, rest = key.partition("/")
+    if array == "labels":
+        name, _, rest = rest.partition("/")
+        label = record.labels.get(name)
+        folder, cache = label.prefix if label else None, REVALIDATED
+    else:
+        folder, cache = f"{record.zarr}/{array}" if array in ARRAYS else None, CACHED
+    if folder is None or not rest:
+        raise _no_such(key)
+    try:
+        return ranged_response(
+            request, context.storage, f"{folder}/{rest}", JSON if rest == DOCUMENT else BYTES, cache=cache
+        )
+    except NotFoundError as error:
+        # What the storage says of it names where the file would be.
+        raise _no_such(key) from error
+
+
+def _no_such(key: str) -> NotFoundError:
+    return NotFoundError(f"There is no file {key[:200]!r} in the cloud.", advice="zarr.json lists the arrays.")
+
+
+def _group_document(storage: Storage, record: CloudRecord, *, labels: bool) -> bytes:
+    """``zarr.json`` of the cloud's group, or of the group of its labels, with consolidated metadata."""
+    own = {name: _document(StoredFolder(storage, label.prefix), DOCUMENT) for name, label in record.labels.items()}
+    if labels:
+        if not own:
+            raise _no_such(f"labels/{DOCUMENT}")
+        document, members = dict(GROUP), own
+    else:
+        source = StoredFolder(storage, record.zarr)
+        document = _document(source, DOCUMENT)
+        members = {name: _document(source, f"{name}/{DOCUMENT}") for name in ARRAYS}
+        if own:
+            members |= {"labels": GROUP, **{f"labels/{name}": found for name, found in own.items()}}
+    document["consolidated_metadata"] = {"kind": "inline", "must_understand": False, "metadata": members}
+    return json_text(document).encode()
+
+
+def _document(source: ByteSource, key: str) -> dict[str, Any]:
+    with damage(source, key.rpartition("/")[0]):
+        found: dict[str, Any] = json.loads(source.read(key))
+        return found

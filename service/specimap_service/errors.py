@@ -1,0 +1,107 @@
+"""Errors that only a request can meet."""
+
+from __future__ import annotations
+
+from specimap_core.errors import SpecimapError
+
+
+class UnauthorizedError(SpecimapError, PermissionError):
+    """No key, or one that is unknown, expired or revoked."""
+
+    code = "unauthorized"
+
+
+class ForbiddenError(SpecimapError, PermissionError):
+    """The key is valid but lacks the scope; ``details['scope']`` names it."""
+
+    code = "forbidden"
+
+
+class RateLimitedError(SpecimapError, RuntimeError):
+    """More requests than the key may make; ``details['retry_after_s']`` says when to come back."""
+
+    code = "rate_limited"
+
+
+class RequestInvalidError(SpecimapError, ValueError):
+    """The request's body, path or query does not fit the contract; details list the fields."""
+
+    code = "request_invalid"
+
+
+class MethodNotAllowedError(SpecimapError, ValueError):
+    """The address exists, but not for this method."""
+
+    code = "method_not_allowed"
+
+
+class PayloadTooLargeError(SpecimapError, ValueError):
+    """A body or a file is larger than the service takes; ``details['limit_bytes']``."""
+
+    code = "payload_too_large"
+
+
+class QuotaExceededError(SpecimapError, ValueError):
+    """The key's quota of stored bytes or files is used up."""
+
+    code = "quota_exceeded"
+
+
+class UploadIncompleteError(SpecimapError, ValueError):
+    """A job was asked for before all its files had arrived; details say what is missing."""
+
+    code = "upload_incomplete"
+
+
+class UploadConflictError(SpecimapError, ValueError):
+    """The upload's offset, length or checksum is not what the client says."""
+
+    code = "upload_conflict"
+
+
+class ChecksumMismatchError(SpecimapError, ValueError):
+    """What arrived does not have the checksum that came with it; nothing of it was kept."""
+
+    code = "checksum_mismatch"
+
+
+class UploadLockedError(SpecimapError, RuntimeError):
+    """Another request is writing to the same upload."""
+
+    code = "upload_locked"
+
+
+class UploadGoneError(SpecimapError, FileNotFoundError):
+    """The upload expired or was ended; ``details['state']`` says which."""
+
+    code = "upload_gone"
+
+
+class IdempotencyConflictError(SpecimapError, ValueError):
+    """The idempotency key was used before, with another request."""
+
+    code = "idempotency_conflict"
+
+
+class PreconditionFailedError(SpecimapError, ValueError):
+    """What is stored is not what the request's If-Match names."""
+
+    code = "precondition_failed"
+
+
+class RangeNotSatisfiableError(SpecimapError, ValueError):
+    """The byte range lies outside of the file; ``details['size']`` is the file's."""
+
+    code = "range_not_satisfiable"
+
+
+class NotAcceptableError(SpecimapError, ValueError):
+    """The answer does not exist in any media type that the request accepts; ``details['offered']`` lists them."""
+
+    code = "not_acceptable"
+
+
+class MediaTypeError(SpecimapError, ValueError):
+    """The body is of a media type that the operation does not take; ``details['offered']`` lists those it does."""
+
+    code = "media_type_unsupported"

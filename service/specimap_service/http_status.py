@@ -1,0 +1,72 @@
+"""The one table that gives each error its HTTP status (RFC 9457)."""
+
+from __future__ import annotations
+
+from specimap_core import errors as core
+from specimap_core.errors import SpecimapError
+from specimap_infra import errors as infra
+from specimap_service import errors as service
+
+HTTP_STATUS: dict[type[SpecimapError], int] = {
+    core.SpecimapError: 500,
+    core.BackendFailedError: 500,
+    core.BackendUnavailableError: 503,
+    core.CancelledError: 409,
+    core.CloudDamagedError: 500,
+    core.CubeContentError: 422,
+    core.CubeFormatError: 415,
+    core.CubeHeaderError: 422,
+    core.CubeNotFoundError: 404,
+    core.CubeNotReadableError: 403,
+    core.CubeTruncatedError: 422,
+    core.DepthNotFoundError: 422,
+    core.DuplicateMarkersError: 422,
+    core.EdgeImplausibleError: 422,
+    core.LabelInvalidError: 422,
+    core.MarkerGeometryError: 422,
+    core.MarkersMissingInCubeError: 422,
+    core.MemoryExhaustedError: 507,
+    core.NoMarkersFoundError: 422,
+    core.NotFoundError: 404,
+    core.OutputExistsError: 409,
+    core.OutputNotWritableError: 500,
+    core.PhotoRawError: 422,
+    core.PhotoUnreadableError: 422,
+    core.PhotosNotConnectedError: 422,
+    core.RegistrationError: 422,
+    core.ResultInsufficientError: 422,
+    core.SettingsError: 422,
+    core.StageFailedError: 500,
+    core.StorageFullError: 507,
+    core.TooFewPhotosError: 422,
+    core.UnknownDictionaryError: 422,
+    core.WrongDictionaryError: 422,
+    infra.DatabaseUnavailableError: 503,
+    infra.JobConflictError: 409,
+    infra.LostLeaseError: 409,
+    infra.StageTimeoutError: 500,
+    infra.StorageUnavailableError: 503,
+    infra.WorkerCrashedError: 500,
+    service.ChecksumMismatchError: 460,
+    service.ForbiddenError: 403,
+    service.IdempotencyConflictError: 409,
+    service.MediaTypeError: 415,
+    service.MethodNotAllowedError: 405,
+    service.NotAcceptableError: 406,
+    service.PayloadTooLargeError: 413,
+    service.PreconditionFailedError: 412,
+    service.QuotaExceededError: 413,
+    service.RangeNotSatisfiableError: 416,
+    service.RateLimitedError: 429,
+    service.RequestInvalidError: 422,
+    service.UnauthorizedError: 401,
+    service.UploadConflictError: 409,
+    service.UploadGoneError: 410,
+    service.UploadIncompleteError: 409,
+    service.UploadLockedError: 423,
+}
+
+
+def status_of(error: SpecimapError) -> int:
+    """HTTP status of an error: its own, or that of the nearest class above it."""
+    return next(HTTP_STATUS[leaf] for leaf in type(error).__mro__ if leaf in HTTP_STATUS)

@@ -1,0 +1,174 @@
+"""Jobs made and removed: the row, its first event and the engine's workflow together or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import sqlalchemy as sa
+from dbos import error as dbos_error
+from sqlalchemy.exc import IntegrityError, SQLAlchemyError
+from sqlalchemy.orm import Session
+
+from specimap_core.errors import NotFoundError
+from specimap_infra.completeness import missing
+from specimap_infra.errors import JobConflictError
+from specimap_infra.ids import new_id
+from specimap_infra.job_schemas import JobView, job_settings, job_views
+from specimap_infra.jobs import append_event, locked
+from specimap_infra.logs import logger
+from specimap_infra.queue import JOBS, RUN_JOB, enqueue
+from specimap_infra.tables import FINAL_STATES, PRIORITIES, Acquisition, Job
+from specimap_infra.webhooks import check_target
+from specimap_service.acquisitions.deletion import Leftovers
+from specimap_service.context import AppContext, audit, correlation_id
+from specimap_service.errors import IdempotencyConflictError, UploadIncompleteError
+from specimap_service.jobs.schemas import JobRequest, RerunRequest, Webhook
+
+
+def new_job(context: AppContext, key_id: str, wanted: JobRequest, idempotency_key: str | None) -> tuple[JobView, bool]:
+    """A job on an acquisition, and whether it was made now.
+
+    Raises:
+        NotFoundError: there is no such acquisition.
+        UploadIncompleteError: something is missing; ``details['missing']``.
+        SettingsError: the webhook's host is not allowed.
+        IdempotencyConflictError: the idempotency key belongs to another request.
+    """
+
+    def row(session: Session) -> Job:
+        acquisition = session.get(Acquisition, wanted.acquisition_id)
+        if acquisition is None:
+            raise _no_acquisition(wanted.acquisition_id)
+        return Job(
+            acquisition_id=acquisition.id,
+            settings=wanted.settings.on(acquisition),
+            priority=PRIORITIES[wanted.priority],
+            webhook=_checked(context, wanted.webhook),
+        )
+
+    return _made_once(context, key_id, idempotency_key, wanted.digest(), row)
+
+
+def repeated_job(
+    context: AppContext, key_id: str, job_id: str, wanted: RerunRequest, idempotency_key: str | None
+) -> tuple[JobView, bool]:
+    """A job as an earlier one was, but for what is given, and whether it was made now. Raises as `new_job`."""
+
+    def row(session: Session) -> Job:
+        earlier = found_job(session, job_id)
+        changed = wanted.settings.model_dump(exclude_unset=True, exclude_none=True) if wanted.settings else {}
+        webhook = wanted.webhook
+        if "webhook" not in wanted.model_fields_set and earlier.webhook is not None:
+            webhook = Webhook(**earlier.webhook)
+        return Job(
+            acquisition_id=earlier.acquisition_id,
+            settings=job_settings({**earlier.settings, **changed}).model_dump(),
+            priority=PRIORITIES[wanted.priority] if wanted.priority else earlier.priority,
+            webhook=_checked(context, webhook),
+            rerun_of=earlier.id,
+        )
+
+    return _made_once(context, key_id, idempotency_key, wanted.digest(job_id), row)
+
+
+def found_job(session: Session, job_id: str) -> Job:
+    """The job's row. Raises NotFoundError."""
+    job = session.get(Job, job_id)
+    if job is None:
+        raise NotFoundError(f"There is no job {job_id}.", advice="Check the id; it may have been deleted.")
+    return job
+
+
+def _made_once(
+    context: AppContext, key_id: str, idempotency_key: str | None, digest: str, row: Callable[[Session], Job]
+) -> tuple[JobView, bool]:
+    earlier = _earlier(context, key_id, idempotency_key, digest)
+    if earlier is not None:
+        return earlier, False
+    try:
+        with context.database.session() as session:
+            job = row(session)
+            lacking = missing(session, job.acquisition_id)
+            if lacking:
+                raise UploadIncompleteError(
+                    f"Acquisition {job.acquisition_id} is not complete: {lacking[0]}",
+                    advice="Upload what is missing, then ask again.",
+                    missing=lacking,
+                )
+            job.id, job.state, job.created_by = new_id("job"), "queued", key_id
+            job.idempotency_key, job.request_hash, job.correlation_id = idempotency_key, digest, correlation_id()
+            session.add(job)
+            # Now, so that a second request with the same idempotency key fails before it enqueues.
+            session.flush()
+            append_event(session, job.id, "state", {"state": "queued", "starts": 0})
+            enqueue(context.queue, session.connection(), JOBS, RUN_JOB, job.id, job.priority)
+            audit(session, key_id, "job.create", job.id, acquisition=job.acquisition_id, rerun_of=job.rerun_of)
+            (view,) = job_views(session, [job])
+            return view, True
+    except IntegrityError as error:
+        # The same request came twice at once, or the acquisition was deleted meanwhile.
+        earlier = _earlier(context, key_id, idempotency_key, digest)
+        if earlier is None:
+            raise _no_acquisition(job.acquisition_id) from error
+        return earlier, False
+
+
+def _earlier(context: AppContext, key_id: str, idempotency_key: str | None, digest: str) -> JobView | None:
+    if idempotency_key is None:
+        return None
+    with context.database.session() as session:
+        job = session.scalar(sa.select(Job).where(Job.created_by == key_id, Job.idempotency_key == idempotency_key))
+        if job is None:
+            return None
+        if job.request_hash != digest:
+            raise IdempotencyConflictError(
+                f"The idempotency key was used for another request, which made {job.id}.",
+                advice="Use a new key for a new request.",
+                job_id=job.id,
+            )
+        return job_views(session, [job])[0]
+
+
+def _checked(context: AppContext, webhook: Webhook | None) -> dict[str, str] | None:
+    if webhook is None:
+        return None
+    check_target(webhook.url, context.settings)
+    return webhook.model_dump()
+
+
+def _no_acquisition(acquisition_id: str) -> NotFoundError:
+    return NotFoundError(f"There is no acquisition {acquisition_id}.", advice="Check the id; it may have been deleted.")
+
+
+# ---- ends ---------------------------------------------------------------------------------------------
+
+
+def stop_workflow(context: AppContext, job_id: str) -> None:
+    """Tell the engine that a job was cancelled. Where it cannot be told, the worker learns from the job's row."""
+    _tell_engine(context.queue.cancel_workflow, job_id)
+
+
+def delete_job(context: AppContext, key_id: str, job_id: str) -> None:
+    """Remove a job that has ended, its result, and all their files.
+
+    Raises:
+        NotFoundError: there is no such job.
+        JobConflictError: it has not ended.
+        StorageUnavailableError: the rows are gone, but files may be left.
+    """
+    with context.database.session() as session:
+        job = locked(session, job_id) or found_job(session, job_id)
+        if job.state not in FINAL_STATES:
+            raise JobConflictError(f"Job {job_id} is {job.state}.", advice="Cancel it first.", state=job.state)
+        acquisition, leftovers = job.acquisition_id, Leftovers.of(session, [job_id])
+        session.execute(sa.delete(Job).where(Job.id == job_id))
+        audit(session, key_id, "job.delete", job_id, acquisition=acquisition)
+    _tell_engine(context.queue.delete_workflow, job_id)
+    leftovers.remove(context)
+
+
+def _tell_engine(call: Callable[[str], None], job_id: str) -> None:
+    try:
+        call(job_id)
+    except (SQLAlchemyError, dbos_error.DBOSException) as error:
+        logger().warning("the job engine could not be told", job=job_id, error=type(error).__name__)

@@ -1,0 +1,176 @@
+"""Jobs' events to many listeners: one look into the database for all of them, however many there are."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from typing import Any
+
+import sqlalchemy as sa
+
+from specimap_infra.database import Database
+from specimap_infra.errors import DatabaseUnavailableError
+from specimap_infra.logs import logger
+from specimap_infra.tables import FINAL_STATES, Job, JobEvent
+
+POLL_SECONDS = 0.25
+KEEP_ALIVE_SECONDS = 15.0
+AWAY_SECONDS = 1.0
+"""How long to wait before a database that did not answer is asked again."""
+PAGE = 500
+KEPT = 512
+"""Events of a job that are kept for its listeners; whoever is further behind reads the database."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """An event of a job; ``seq`` counts from 1 without a gap."""
+
+    seq: int
+    type: str
+    data: dict[str, Any]
+
+    @property
+    def final(self) -> bool:
+        """Whether nothing comes after it."""
+        return self.type == "state" and self.data["state"] in FINAL_STATES
+
+
+@dataclass
+class _Channel:
+    """A job that is listened to: its newest events, and who waits for more."""
+
+    head: int
+    recent: deque[Event] = field(default_factory=lambda: deque(maxlen=KEPT))
+    listeners: int = 0
+    news: asyncio.Event = field(default_factory=asyncio.Event)
+
+    def add(self, events: list[Event]) -> None:
+        self.recent.extend(events)
+        self.head = events[-1].seq
+        # Each waiter holds the old event; the next ones wait for the new.
+        self.news.set()
+        self.news = asyncio.Event()
+
+    def after(self, seq: int) -> list[Event] | None:
+        """Events after ``seq``; None where they are not kept any more."""
+        if seq >= self.head:
+            return []
+        if not self.recent or self.recent[0].seq > seq + 1:
+            return None
+        return [event for event in self.recent if event.seq > seq]
+
+
+class JobEvents:
+    """Events by job. Used on one event loop; the database is read in threads, and no connection waits."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._channels: dict[str, _Channel] = {}
+        self._poller: asyncio.Task[None] | None = None
+        self._joined = asyncio.Event()
+
+    async def follow(self, job_id: str, after: int) -> AsyncIterator[Event | None]:
+        """Events after number ``after``, as they come; None now and then where nothing happens.
+
+        Ends after the final event, and where the job is deleted. Goes on when the database was away.
+        """
+        with self._listening(job_id, after) as channel:
+            seq = after
+            while True:
+                news = channel.news
+                events = channel.after(seq)
+                if events is None:
+                    try:
+                        found = await asyncio.to_thread(read_events, self._database, {job_id: seq})
+                    except DatabaseUnavailableError:
+                        yield None
+                        await asyncio.sleep(AWAY_SECONDS)
+                        continue
+                    events = found.get(job_id, [])
+                for event in events:
+                    yield event
+                    seq = event.seq
+                    if event.final:
+                        return
+                if events:
+                    continue
+                try:
+                    await asyncio.wait_for(news.wait(), KEEP_ALIVE_SECONDS)
+                except TimeoutError:
+                    if not await self._alive(job_id):
+                        return
+                    yield None
+
+    @contextmanager
+    def _listening(self, job_id: str, after: int) -> Iterator[_Channel]:
+        if job_id not in self._channels:
+            self._channels[job_id] = _Channel(after)
+            self._joined.set()
+        channel = self._channels[job_id]
+        channel.listeners += 1
+        if self._poller is None or self._poller.done():
+            self._poller = asyncio.create_task(self._poll())
+        try:
+            yield channel
+        finally:
+            channel.listeners -= 1
+            if not channel.listeners:
+                del self._channels[job_id]
+
+    async def _poll(self) -> None:
+        while self._channels:
+            heads = {job_id: channel.head for job_id, channel in self._channels.items()}
+            found: dict[str, list[Event]] = {}
+            wait = POLL_SECONDS
+            try:
+                found = await asyncio.to_thread(read_events, self._database, heads)
+            except DatabaseUnavailableError:
+                wait = AWAY_SECONDS
+            except Exception:
+                # Whatever it was, the listeners of all jobs hang on this task.
+                logger().exception("reading of job events failed")
+                wait = AWAY_SECONDS
+            for job_id, events in found.items():
+                channel = self._channels.get(job_id)
+                # A channel that was closed and opened again meanwhile may stand elsewhere.
+                if channel is not None and channel.head == heads[job_id]:
+                    channel.add(events)
+            if sum(map(len, found.values())) < PAGE:
+                await self._wait(wait)
+
+    async def _wait(self, seconds: float) -> None:
+        """Wait, but no longer than until a job is listened to that was not before."""
+        self._joined.clear()
+        with suppress(TimeoutError):
+            await asyncio.wait_for(self._joined.wait(), seconds)
+
+    async def _alive(self, job_id: str) -> bool:
+        def look() -> bool:
+            with self._database.session() as session:
+                return session.get(Job, job_id) is not None
+
+        try:
+            return await asyncio.to_thread(look)
+        except DatabaseUnavailableError:
+            return True
+
+
+def read_events(database: Database, after: dict[str, int]) -> dict[str, list[Event]]:
+    """The next events of each job after a number, at most 500 in all; jobs without any are left out.
+
+    Raises:
+        DatabaseUnavailableError: the database cannot be reached.
+    """
+    found: dict[str, list[Event]] = {}
+    if not after:
+        return found
+    wanted = sa.or_(*(sa.and_(JobEvent.job_id == job_id, JobEvent.seq > seq) for job_id, seq in after.items()))
+    query = sa.select(JobEvent.job_id, JobEvent.seq, JobEvent.type, JobEvent.data).where(wanted)
+    with database.session() as session:
+        for job_id, seq, type, data in session.execute(query.order_by(JobEvent.job_id, JobEvent.seq).limit(PAGE)):
+            found.setdefault(job_id, []).append(Event(seq, type, data))
+    return found

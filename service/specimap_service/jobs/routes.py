@@ -1,0 +1,207 @@
+"""Jobs: made, watched, cancelled, repeated, deleted."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from typing import Annotated, Any
+
+import sqlalchemy as sa
+from fastapi import APIRouter, Query, Response
+from fastapi.concurrency import run_in_threadpool
+from fastapi.sse import KEEPALIVE_COMMENT, EventSourceResponse, format_sse_event
+
+from specimap_core.errors import NotFoundError
+from specimap_core.json_text import json_text
+from specimap_core.report.model import Report
+from specimap_infra.errors import JobConflictError
+from specimap_infra.job_schemas import JobState, JobView, job_views
+from specimap_infra.jobs import locked, request_cancel
+from specimap_infra.tables import FINAL_STATES, CloudRow, Job, JobEvent
+from specimap_service.auth.keys import Admin, Reader, Uploader
+from specimap_service.context import AppContext, Context, audit
+from specimap_service.jobs.commands import delete_job, found_job, new_job, repeated_job, stop_workflow
+from specimap_service.jobs.schemas import (
+    AfterJob,
+    AfterSeq,
+    IdempotencyKey,
+    JobId,
+    JobRequest,
+    LastEventId,
+    LogLine,
+    RerunRequest,
+)
+from specimap_service.paging import Limit, Moment, Page, page_of
+
+router = APIRouter(prefix="/v1", tags=["jobs"])
+
+AGAIN: dict[int | str, dict[str, Any]] = {200: {"model": JobView, "description": "Made before by the same request"}}
+
+
+@router.post("/jobs", status_code=202, responses=AGAIN)
+def create_job(
+    context: Context,
+    principal: Uploader,
+    response: Response,
+    wanted: JobRequest,
+    idempotency_key: IdempotencyKey = None,
+) -> JobView:
+    """Queue a job on an acquisition that is complete."""
+    return _answer(response, *new_job(context, principal.key_id, wanted, idempotency_key))
+
+
+@router.post("/jobs/{job_id}/rerun", status_code=202, responses=AGAIN)
+def rerun_job(
+    context: Context,
+    principal: Uploader,
+    response: Response,
+    job_id: JobId,
+    wanted: RerunRequest | None = None,
+    idempotency_key: IdempotencyKey = None,
+) -> JobView:
+    """Queue a job as this one was, with other settings; stages that these do not change are not repeated."""
+    return _answer(
+        response, *repeated_job(context, principal.key_id, job_id, wanted or RerunRequest(), idempotency_key)
+    )
+
+
+def _answer(response: Response, job: JobView, made: bool) -> JobView:
+    response.headers["Location"] = f"/v1/jobs/{job.id}"
+    response.status_code = 202 if made else 200
+    return job
+
+
+@router.get("/jobs")
+def list_jobs(
+    context: Context,
+    principal: Reader,
+    acquisition_id: Annotated[str | None, Query(pattern=r"^acq_[0-9a-z]{26}$")] = None,
+    state: Annotated[list[JobState] | None, Query(description="Any of these states.")] = None,
+    created_after: Moment | None = None,
+    created_before: Moment | None = None,
+    after: AfterJob = None,
+    limit: Limit = 100,
+) -> Page[JobView]:
+    """Jobs, newest first."""
+    query = sa.select(Job).order_by(Job.id.desc()).limit(limit + 1)
+    if acquisition_id is not None:
+        query = query.where(Job.acquisition_id == acquisition_id)
+    if state:
+        query = query.where(Job.state.in_(state))
+    if created_after is not None:
+        query = query.where(Job.created_at >= created_after)
+    if created_before is not None:
+        query = query.where(Job.created_at < created_before)
+    if after is not None:
+        query = query.where(Job.id < after)
+    with context.database.session() as session:
+        jobs = job_views(session, list(session.scalars(query)))
+    return page_of(jobs, [job.id for job in jobs], limit)
+
+
+@router.get("/jobs/{job_id}")
+def get_job(context: Context, principal: Reader, job_id: JobId) -> JobView:
+    """A job as it is now."""
+    with context.database.session() as session:
+        return job_views(session, [found_job(session, job_id)])[0]
+
+
+@router.post("/jobs/{job_id}/cancel", status_code=202)
+def cancel_job(context: Context, principal: Uploader, job_id: JobId) -> JobView:
+    """Cancel a job that waits or runs; what its finished stages left is kept for a rerun."""
+    with context.database.session() as session:
+        before = locked(session, job_id)
+        changes = before is not None and before.state != "cancelled"
+        (view,) = job_views(session, [request_cancel(session, job_id)])
+        if changes:
+            audit(session, principal.key_id, "job.cancel", job_id)
+    stop_workflow(context, job_id)
+    return view
+
+
+@router.delete("/jobs/{job_id}", status_code=204)
+def remove_job(context: Context, principal: Admin, job_id: JobId) -> None:
+    """Delete a job that has ended, with its result."""
+    delete_job(context, principal.key_id, job_id)
+
+
+@router.get("/jobs/{job_id}/report")
+def get_report(context: Context, principal: Reader, job_id: JobId) -> Report:
+    """The report on the job's result."""
+    with context.database.session() as session:
+        job = found_job(session, job_id)
+        if job.state != "succeeded":
+            raise JobConflictError(
+                f"Job {job_id} is {job.state}; only a job that succeeded has a report.",
+                advice="Wait for it to succeed; `error` says why it failed.",
+                state=job.state,
+            )
+        report = session.scalar(sa.select(CloudRow.report).where(CloudRow.job_id == job_id))
+    if report is None:
+        raise NotFoundError(f"Job {job_id} has no result any more.", advice="Rerun it.")
+    return Report.model_validate(report)
+
+
+@router.get("/jobs/{job_id}/log")
+def get_log(
+    context: Context, principal: Reader, job_id: JobId, after: AfterSeq = None, limit: Limit = 100
+) -> Page[LogLine]:
+    """The job's log, oldest line first."""
+    query = (
+        sa.select(JobEvent)
+        .where(JobEvent.job_id == job_id, JobEvent.type == "log", JobEvent.seq > (after or 0))
+        .order_by(JobEvent.seq)
+        .limit(limit + 1)
+    )
+    with context.database.session() as session:
+        found_job(session, job_id)
+        lines = [
+            LogLine(seq=row.seq, at=row.at, level=row.data["level"], message=row.data["message"], data=row.data["data"])
+            for row in session.scalars(query)
+        ]
+    return page_of(lines, [str(line.seq) for line in lines], limit)
+
+
+@router.get(
+    "/jobs/{job_id}/events",
+    response_class=Response,
+    responses={
+        200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}, "description": "Events as they come"},
+        204: {"description": "The job has ended and there is nothing after the last event seen: do not come again"},
+    },
+)
+async def follow_events(
+    context: Context,
+    principal: Reader,
+    job_id: JobId,
+    last_event_id: LastEventId = None,
+    after: AfterSeq = None,
+) -> Response:
+    """What happens to the job, from its beginning or after the last event seen, until it ends.
+
+    `event` is `state` {state, error, cloud_id}, `progress` {stage, progress} or `log` {level, message, data}; `id`
+    counts from 1. A comment comes every 15 s where nothing else does.
+    """
+    start = int(last_event_id) if last_event_id else after or 0
+    if await run_in_threadpool(_nothing_after, context, job_id, start):
+        return Response(status_code=204)
+    return EventSourceResponse(
+        _encoded(context, job_id, start),
+        # Proxies that gather answers would keep the events back.
+        headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
+    )
+
+
+def _nothing_after(context: AppContext, job_id: str, seq: int) -> bool:
+    with context.database.session() as session:
+        job = found_job(session, job_id)
+        later = sa.select(JobEvent.seq).where(JobEvent.job_id == job_id, JobEvent.seq > seq).limit(1)
+        # The state first: events that come between the two looks are then seen.
+        return job.state in FINAL_STATES and session.scalar(later) is None
+
+
+async def _encoded(context: AppContext, job_id: str, after: int) -> AsyncIterator[bytes]:
+    async for event in context.events.follow(job_id, after):
+        if event is None:
+            yield KEEPALIVE_COMMENT
+        else:
+            yield format_sse_event(data_str=json_text(event.data), event=event.type, id=str(event.seq))

@@ -1,0 +1,98 @@
+"""What clients send about jobs, and what they read of their logs."""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+from typing import Annotated, Any
+
+from fastapi import Header, Path, Query
+from pydantic import BaseModel, ConfigDict, Field
+
+from specimap_core.json_text import json_text
+from specimap_infra.job_schemas import JobSettings, PriorityName
+
+JobId = Annotated[str, Path(pattern=r"^job_[0-9a-z]{26}$")]
+AfterJob = Annotated[str | None, Query(pattern=r"^job_[0-9a-z]{26}$", description="`next` of the page before.")]
+AfterSeq = Annotated[int | None, Query(ge=0, lt=2**31, description="Only what came after the event of this number.")]
+IdempotencyKey = Annotated[
+    str | None,
+    Header(
+        pattern=r"^[\x20-\x7e]{1,128}$",
+        description="A name for this request: sent again with the same, it answers with the job it made before.",
+    ),
+]
+LastEventId = Annotated[
+    str | None, Header(pattern=r"^\d{0,9}$", description="Number of the last event seen; the stream goes on after it.")
+]
+
+
+class Webhook(BaseModel):
+    """Who to tell that the job has ended."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={"example": {"url": "https://pacs.example/specimap", "secret": "0f6a3c0b1d5e4a7f"}},
+    )
+
+    url: str = Field(max_length=2000, description="Its host is one that the service may send to.")
+    secret: str = Field(
+        min_length=16,
+        max_length=256,
+        repr=False,
+        description="Key of the signature in `X-Specimap-Signature`: `t=<unix seconds>,v1=<hex>`, HMAC-SHA256 of "
+        "`<t>.<body>`.",
+    )
+
+
+class JobRequest(BaseModel):
+    """A job to be made."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "example": {
+                "acquisition_id": "acq_01k00000000000000000000000",
+                "settings": {"method": "camera", "r_pc": 0.5},
+                "priority": "intraoperative",
+            }
+        },
+    )
+
+    acquisition_id: str = Field(pattern=r"^acq_[0-9a-z]{26}$")
+    settings: JobSettings = Field(default_factory=JobSettings)
+    priority: PriorityName = "routine"
+    webhook: Webhook | None = None
+
+    def digest(self) -> str:
+        """Hash by which the same request is known again."""
+        return digest_of(self.model_dump(mode="json"))
+
+
+class RerunRequest(BaseModel):
+    """A job to be made as another was, but for what is given here."""
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"example": {"settings": {"r_pc": 0.25}}})
+
+    settings: JobSettings | None = Field(default=None, description="What is left out is as it was.")
+    priority: PriorityName | None = Field(default=None, description="By default as it was.")
+    webhook: Webhook | None = Field(default=None, description="By default as it was; null sends nothing.")
+
+    def digest(self, job_id: str) -> str:
+        """Hash by which the same request is known again."""
+        return digest_of({"rerun": job_id, **self.model_dump(mode="json", exclude_unset=True)})
+
+
+def digest_of(request: dict[str, Any]) -> str:
+    """SHA-256 of a request's values."""
+    return hashlib.sha256(json_text(request, sort_keys=True).encode()).hexdigest()
+
+
+class LogLine(BaseModel):
+    """A line of a job's log."""
+
+    seq: int = Field(description="The event's number; gaps are events of another type.")
+    at: datetime.datetime
+    level: str
+    message: str
+    data: dict[str, Any]

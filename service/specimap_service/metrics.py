@@ -1,0 +1,112 @@
+"""Prometheus metrics, named ``specimap_<noun>_<verb>_<unit>``; what stands in the database is read when asked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import sqlalchemy as sa
+from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+from prometheus_client.registry import Collector
+
+from specimap_infra.database import Database, utc_now
+from specimap_infra.errors import DatabaseUnavailableError, StorageUnavailableError
+from specimap_infra.storage import Storage
+from specimap_infra.tables import JOB_STATES, Artefact, CloudRow, Job, Lease, StoredFile
+
+REQUEST_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 60)
+
+
+class Metrics:
+    """The metrics of one app."""
+
+    def __init__(self, database: Database, storage: Storage) -> None:
+        self.registry = CollectorRegistry()
+        self._requests = Histogram(
+            "specimap_requests_handle_seconds",
+            "Time to answer a request.",
+            ("method", "route", "status"),
+            buckets=REQUEST_BUCKETS,
+            registry=self.registry,
+        )
+        self.uploaded = Counter("specimap_uploads_receive_bytes", "Bytes taken in by uploads.", registry=self.registry)
+        self.judged = Counter(
+            "specimap_files_judge_total", "Files judged on arrival, by verdict.", ("verdict",), registry=self.registry
+        )
+        self.registry.register(_FromDatabase(database, storage))
+
+    def observe_request(self, method: str, route: str, status: int, seconds: float) -> None:
+        """Count one request; ``status`` 0 is a client that went away."""
+        self._requests.labels(method, route, str(status)).observe(seconds)
+
+    def text(self) -> bytes:
+        """In Prometheus' text format."""
+        return generate_latest(self.registry)
+
+
+class _FromDatabase(Collector):
+    def __init__(self, database: Database, storage: Storage) -> None:
+        self._database = database
+        self._storage = storage
+
+    def describe(self) -> list[GaugeMetricFamily]:
+        """Nothing, so that registering asks no database."""
+        return []
+
+    def collect(self) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
+        """Queue, jobs, stages, storage; nothing where the database is away."""
+        try:
+            yield from self._jobs()
+            yield from self._stored()
+        except DatabaseUnavailableError:
+            return
+
+    def _jobs(self) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
+        with self._database.session() as session:
+            by_state = session.execute(sa.select(Job.state, sa.func.count()).group_by(Job.state))
+            counts = {row[0]: int(row[1]) for row in by_state}
+            oldest = session.scalar(sa.select(sa.func.min(Job.created_at)).where(Job.state == "queued"))
+            errors = session.scalars(sa.select(Job.error).where(Job.state == "failed")).all()
+            seconds = session.scalars(sa.select(Job.seconds).where(Job.state == "succeeded")).all()
+            workers = session.scalar(sa.select(sa.func.count()).select_from(Lease))
+        jobs = GaugeMetricFamily("specimap_jobs", "Jobs by state.", labels=("state",))
+        for state in JOB_STATES:
+            jobs.add_metric((state,), counts.get(state, 0))
+        yield jobs
+        age = (utc_now() - oldest).total_seconds() if oldest else 0.0
+        yield GaugeMetricFamily("specimap_queue_wait_seconds", "Age of the oldest queued job.", value=max(age, 0.0))
+        yield GaugeMetricFamily("specimap_workers", "Workers that say they are alive.", value=workers or 0)
+        failures = CounterMetricFamily("specimap_jobs_fail", "Failed jobs by code.", labels=("code",))
+        by_code: dict[str, int] = {}
+        for error in errors:
+            code = str((error or {}).get("code", "unknown"))
+            by_code[code] = by_code.get(code, 0) + 1
+        for code, count in sorted(by_code.items()):
+            failures.add_metric((code,), count)
+        yield failures
+        spent = CounterMetricFamily("specimap_stages_run_seconds", "Time spent in stages.", labels=("stage",))
+        totals: dict[str, float] = {}
+        for stages in seconds:
+            for stage, value in stages.items():
+                totals[stage] = totals.get(stage, 0.0) + float(value)
+        for stage, total in sorted(totals.items()):
+            spent.add_metric((stage,), total)
+        yield spent
+
+    def _stored(self) -> Iterator[GaugeMetricFamily]:
+        with self._database.session() as session:
+            sizes = {
+                "files": session.scalar(sa.select(sa.func.sum(StoredFile.size))),
+                "artefacts": session.scalar(sa.select(sa.func.sum(Artefact.size))),
+                "clouds": session.scalar(sa.select(sa.func.sum(CloudRow.size))),
+            }
+        stored = GaugeMetricFamily("specimap_storage_use_bytes", "Stored bytes by kind.", labels=("kind",))
+        for kind, size in sizes.items():
+            stored.add_metric((kind,), float(size or 0))
+        yield stored
+        try:
+            free = self._storage.free_bytes()
+        except StorageUnavailableError:
+            free = None
+        if free is not None:
+            yield GaugeMetricFamily("specimap_storage_free_bytes", "Free space of the storage.", value=float(free))

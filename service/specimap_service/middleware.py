@@ -1,0 +1,64 @@
+"""Plain ASGI middleware: a correlation id, an access log, metrics, and a last answer to unforeseen errors."""
+
+from __future__ import annotations
+
+import re
+import secrets
+import time
+
+import structlog
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from specimap_core.errors import SpecimapError
+from specimap_infra.logs import logger
+from specimap_service.metrics import Metrics
+from specimap_service.problems import problem_response
+
+HEADER = b"x-correlation-id"
+ACCEPTED = re.compile(rb"^[A-Za-z0-9._-]{8,64}$")
+QUIET = ("/healthz", "/readyz", "/metrics")
+
+
+class Observed:
+    """Everything that is seen of a request from outside. No address, key or uploaded name is logged."""
+
+    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+        self._app = app
+        self._metrics = metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        given = dict(scope["headers"]).get(HEADER, b"")
+        correlation = given.decode() if ACCEPTED.match(given) else secrets.token_hex(8)
+        structlog.contextvars.clear_contextvars()
+        structlog.contextvars.bind_contextvars(correlation_id=correlation)
+        start, status = time.perf_counter(), 0
+
+        async def observed_send(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                message["headers"] = [
+                    *message.get("headers", []),
+                    (HEADER, correlation.encode()),
+                    (b"x-content-type-options", b"nosniff"),
+                ]
+            await send(message)
+
+        try:
+            await self._app(scope, receive, observed_send)
+        except Exception:
+            logger().exception("unforeseen error")
+            if status:  # the answer has begun; cutting it off is all that is left
+                raise
+            error = SpecimapError("An error that Specimap does not know.", advice="Report it with the correlation id.")
+            await problem_response(error)(scope, receive, observed_send)
+        finally:
+            seconds = time.perf_counter() - start
+            route = getattr(scope.get("route"), "path", None) or "unmatched"
+            self._metrics.observe_request(scope["method"], route, status, seconds)
+            log = logger().debug if scope["path"] in QUIET else logger().info
+            log("request", method=scope["method"], route=route, status=status, seconds=round(seconds, 4))

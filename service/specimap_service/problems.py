@@ -1,0 +1,146 @@
+"""Errors as problem+json (RFC 9457): code, what is wrong, what to do, and the correlation id to ask about."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, ConfigDict, Field
+from pydantic.json_schema import models_json_schema
+from starlette.exceptions import HTTPException
+
+from specimap_core.errors import NotFoundError, SpecimapError
+from specimap_infra.logs import logger
+from specimap_service.context import correlation_id
+from specimap_service.errors import (
+    MethodNotAllowedError,
+    PayloadTooLargeError,
+    RateLimitedError,
+    RequestInvalidError,
+    UnauthorizedError,
+    UploadConflictError,
+)
+from specimap_service.http_status import status_of
+
+MEDIA_TYPE = "application/problem+json"
+
+
+class Problem(BaseModel):
+    """What every error answer holds."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {
+                "type": "urn:specimap:error:not_found",
+                "title": "not_found",
+                "status": 404,
+                "code": "not_found",
+                "detail": "There is no job job_01k0000000000000000000000.",
+                "advice": "Check the id.",
+                "details": {},
+                "correlation_id": "5f0c2a9d8b7e4c31",
+            }
+        }
+    )
+
+    type: str = Field(description="URN of the error's kind.")
+    title: str = Field(description="The code, again, as RFC 9457 wants a title.")
+    status: int
+    code: str = Field(description="Stable code; docs/errors.md lists all.")
+    detail: str = Field(description="What is wrong, in a sentence.")
+    advice: str = Field(description="What to do.")
+    details: dict[str, Any] = Field(description="Values that a program can use.")
+    correlation_id: str = Field(description="Stands in the service's log lines of the same request.")
+
+
+RESPONSES: dict[int | str, dict[str, Any]] = {
+    "4XX": {"description": "Refused", "model": Problem, "content": {MEDIA_TYPE: {}}},
+    "5XX": {"description": "Failed", "model": Problem, "content": {MEDIA_TYPE: {}}},
+}
+"""For each operation's documentation."""
+
+
+def problem_response(error: SpecimapError, status: int | None = None, **headers: str) -> JSONResponse:
+    """The answer to an error."""
+    status = status or status_of(error)
+    if isinstance(error, RateLimitedError):
+        headers["Retry-After"] = str(error.details.get("retry_after_s", 1))
+    if isinstance(error, UnauthorizedError):
+        headers["WWW-Authenticate"] = "Bearer"
+    body = Problem(
+        type=f"urn:specimap:error:{error.code}",
+        title=error.code,
+        status=status,
+        code=error.code,
+        detail=error.message,
+        advice=error.advice,
+        details=error.details,
+        correlation_id=correlation_id(),
+    )
+    return JSONResponse(body.model_dump(mode="json"), status, headers, MEDIA_TYPE)
+
+
+def install(app: FastAPI) -> None:
+    """Answer every error of the app with a problem."""
+
+    @app.exception_handler(SpecimapError)
+    async def _known(request: Request, error: SpecimapError) -> JSONResponse:
+        if status_of(error) >= 500:
+            logger().error("request failed", code=error.code, exc_info=error)
+        return problem_response(error)
+
+    @app.exception_handler(RequestValidationError)
+    async def _invalid(request: Request, error: RequestValidationError) -> JSONResponse:
+        fields = [{"where": ".".join(str(part) for part in e["loc"]), "what": e["msg"]} for e in error.errors()[:20]]
+        first = fields[0] if fields else {"where": "body", "what": "does not read"}
+        return problem_response(
+            RequestInvalidError(
+                f"{first['where']}: {first['what']}.", advice="Correct the request; /docs shows it.", fields=fields
+            )
+        )
+
+    @app.exception_handler(HTTPException)
+    async def _http(request: Request, error: HTTPException) -> JSONResponse:
+        leaf = _LEAVES.get(error.status_code, SpecimapError if error.status_code >= 500 else RequestInvalidError)
+        return problem_response(
+            leaf(str(error.detail) + ".", advice="/docs shows what there is."),
+            error.status_code,
+            **(dict(error.headers) if error.headers else {}),
+        )
+
+
+def describe(app: FastAPI, read_apart: Sequence[type[BaseModel]] = ()) -> None:
+    """Leave out of the app's description what HTTP itself speaks of: a server answers a wrong one before the app.
+
+    ``read_apart``: models of bodies that routes read themselves and only refer to.
+    """
+    described = app.openapi
+    _, more = models_json_schema(
+        [(model, "validation") for model in read_apart], ref_template="#/components/schemas/{model}"
+    )
+
+    def openapi() -> dict[str, Any]:
+        contract = described()
+        schemas = contract["components"]["schemas"]
+        contract["components"]["schemas"] = dict(sorted((schemas | more.get("$defs", {})).items()))
+        for operations in contract["paths"].values():
+            for operation in operations.values():
+                given = operation.get("parameters", [])
+                operation["parameters"] = [p for p in given if p["name"].lower() not in OF_HTTP]
+        return contract
+
+    app.openapi = openapi  # type: ignore[method-assign]
+
+
+OF_HTTP = ("content-length", "content-type")
+
+
+_LEAVES: dict[int, type[SpecimapError]] = {
+    404: NotFoundError,
+    405: MethodNotAllowedError,
+    409: UploadConflictError,
+    413: PayloadTooLargeError,
+}

@@ -1,0 +1,145 @@
+"""Files of an acquisition sent in one form."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from fastapi import APIRouter, Request
+
+from specimap_infra.ids import new_id
+from specimap_infra.tables import Acquisition
+from specimap_service.acquisitions.capacity import (
+    check_count,
+    check_disks,
+    check_size,
+    largest,
+    no_acquisition,
+    quota_left,
+)
+from specimap_service.acquisitions.inspection import Arrival
+from specimap_service.acquisitions.intake import shown_name, take_in
+from specimap_service.acquisitions.schemas import AcquisitionId, File
+from specimap_service.auth.keys import Principal, Uploader
+from specimap_service.context import AppContext, Context
+from specimap_service.errors import QuotaExceededError, RequestInvalidError
+from specimap_service.uploads.multipart import FormFiles, Part
+from specimap_service.uploads.routes import Files
+
+router = APIRouter(prefix="/v1", tags=["files"])
+DISK_EVERY = 64 * 1024 * 1024
+FORM: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "required": ["role", "file"],
+                    "properties": {
+                        "role": {
+                            "type": "string",
+                            "enum": ["photo", "cube", "white", "dark"],
+                            "description": "Of the files that follow it.",
+                        },
+                        "sha256": {"type": "string", "description": "Of the next file, in hexadecimal digits."},
+                        "file": {"type": "array", "items": {"type": "string", "format": "binary"}},
+                    },
+                }
+            }
+        },
+    }
+}
+
+
+class _Room:
+    """The limits of one request; ``left`` bytes are left of the key's quota."""
+
+    def __init__(self, context: AppContext, acquisition_id: str, left: int) -> None:
+        self._context, self._acquisition_id, self._left = context, acquisition_id, left
+        self._photos = 0
+        self._asked_at = 0
+
+    def begin(self, role: str, files: int) -> None:
+        """One more file."""
+        if role == "photo":
+            self._photos += 1
+            with self._context.database.session() as session:
+                check_count(session, self._context.settings, self._acquisition_id, self._photos)
+        elif files > 20:
+            raise RequestInvalidError("More than 20 files in one form.", advice="Send fewer at a time.")
+
+    def grow(self, role: str, size: int, total: int) -> None:
+        """More bytes."""
+        if size > largest(self._context.settings, role):
+            check_size(self._context.settings, role, size)
+        if total > self._left:
+            raise _over_quota(self._left)
+        if total - self._asked_at > DISK_EVERY:
+            self._asked_at = total
+            check_disks(self._context, 0)
+
+
+def _over_quota(left: int) -> QuotaExceededError:
+    return QuotaExceededError(
+        f"The key's quota leaves {max(left, 0)} bytes.",
+        advice="Delete acquisitions that are no longer needed, or ask the administrator for a higher quota.",
+        left_bytes=max(left, 0),
+    )
+
+
+@router.post("/acquisitions/{acquisition_id}/files", status_code=201, openapi_extra=FORM)
+async def add_files(
+    context: Context, principal: Uploader, uploads: Files, request: Request, acquisition_id: AcquisitionId
+) -> list[File]:
+    """Send some files in one form: `role` before its files. For large files and shaky networks use /v1/uploads."""
+    room = await asyncio.to_thread(_room, context, principal, request, acquisition_id)
+    form = FormFiles(uploads.folder, room)
+    try:
+        parts = await form.read(request)
+        context.metrics.uploaded.inc(sum(part.size for part in parts))
+        return await asyncio.to_thread(_store, context, principal, acquisition_id, parts)
+    finally:
+        await asyncio.to_thread(form.close)
+
+
+def _room(context: AppContext, principal: Principal, request: Request, acquisition_id: str) -> _Room:
+    """All that can be refused before the body is read."""
+    length = request.headers.get("content-length", "0")
+    announced = int(length) if length.isdecimal() else 0
+    settings = context.settings
+    with context.database.session() as session:
+        if session.get(Acquisition, acquisition_id) is None:
+            raise no_acquisition(acquisition_id)
+        left = quota_left(session, principal)
+    check_disks(context, announced)
+    # Boundaries, headers and fields of the form count as a mebibyte.
+    most = max(settings.max_cube_bytes, settings.max_photo_bytes * settings.max_photos) + (1 << 20)
+    if announced > most:
+        check_size(settings, "cube", announced)
+    if announced > left + (1 << 20):
+        raise _over_quota(left)
+    return _Room(context, acquisition_id, left)
+
+
+def _store(context: AppContext, principal: Principal, acquisition_id: str, parts: list[Part]) -> list[File]:
+    stored: list[File] = []
+    for part in parts:
+        if not part.size:
+            raise RequestInvalidError("A file is empty.", advice="Send the file itself.", stored=[f.id for f in stored])
+        row = take_in(
+            context,
+            Arrival(
+                new_id("file"),
+                acquisition_id,
+                part.role,
+                shown_name(part.name),
+                part.path,
+                part.size,
+                part.sha256,
+                principal.key_id,
+                principal,
+            ),
+        )
+        stored.append(File.model_validate(row))
+    return stored

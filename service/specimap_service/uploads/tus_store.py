@@ -1,0 +1,169 @@
+"""The storage that ``tuspyserver`` writes to: our upload files, with rows instead of side files."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import threading
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+from tuspyserver.storage import TusStorage
+
+from specimap_core.atomic import disk_errors
+from specimap_core.errors import SpecimapError
+from specimap_infra.errors import StorageUnavailableError
+from specimap_service.auth.keys import Principal
+from specimap_service.uploads.files import POLL_SECONDS, UploadFiles, busy
+from specimap_service.uploads.tus import BATCH, Exchange, exchange, http_date
+
+TAKEOVER_SECONDS = 2.0
+"""Silence after which another request for the same upload may take over."""
+LOCK_SECONDS = 4.0
+
+
+class _Held:
+    """A locked file that a request appends to. ``error`` is what a write failed with."""
+
+    def __init__(self, handle: int, holder: Exchange) -> None:
+        self.holder = holder
+        self.pending = bytearray()
+        self.error: SpecimapError | None = None
+        self._handle = handle
+        self._lock = threading.Lock()
+
+    def write(self, folder: Path, *, sync: bool) -> int:
+        """Append what is pending; returns its bytes. Raises StorageFullError, StorageUnavailableError."""
+        with self._lock:
+            data, self.pending = self.pending, bytearray()
+            try:
+                with disk_errors(folder), memoryview(data) as view:
+                    at = 0
+                    while at < len(view):
+                        at += os.write(self._handle, view[at:])
+                    if sync:
+                        os.fdatasync(self._handle)
+            except SpecimapError as error:
+                self.error = error
+                raise
+            except OSError as error:
+                self.error = StorageUnavailableError("The bytes cannot be written.", advice="Try again later.")
+                raise self.error from error
+            return len(data)
+
+    def close(self) -> None:
+        """Let go of the file and its lock; waits for a write that a cancelled request left under way."""
+        with self._lock:
+            os.close(self._handle)
+            # A write that begins after this fails instead of reaching another file of the same number.
+            self._handle = -1
+
+
+class UploadStore(TusStorage):
+    """The library's storage interface on :class:`UploadFiles`. Rows, not side files, say what an upload is."""
+
+    def __init__(
+        self, files: UploadFiles, *, received: Callable[[int], None], delete: Callable[[str, Principal], None]
+    ) -> None:
+        self._files, self._received, self._delete = files, received, delete
+        self._held: dict[str, _Held] = {}
+
+    async def create(self, uid: str) -> None:
+        """Nothing: the file was made before the row."""
+
+    async def exists(self, uid: str) -> bool:
+        """Whether the request's upload has a file, or once had it whole."""
+        upload = exchange().upload
+        return upload is not None and (upload.state != "open" or self._files.size(uid) is not None)
+
+    async def size(self, uid: str) -> int:
+        """Bytes that have arrived."""
+        upload = exchange().upload
+        if upload is not None and upload.state != "open":
+            return upload.size
+        return self._files.size(uid) or 0
+
+    async def append(self, uid: str, chunk: bytes) -> None:
+        """Take a piece; it is written with others."""
+        held = self._held[uid]
+        held.pending += chunk
+        if len(held.pending) >= BATCH:
+            await asyncio.to_thread(self._write, held, sync=False)
+
+    async def flush(self, uid: str) -> None:
+        """Bring everything to the disk."""
+        if uid in self._held:
+            await asyncio.to_thread(self._write, self._held[uid], sync=True)
+
+    def _write(self, held: _Held, *, sync: bool) -> None:
+        # A failure is raised again when the lock is let go: from here the library would answer it with success.
+        self._received(held.write(self._files.folder, sync=sync))
+
+    async def finalize(self, uid: str) -> None:
+        """Nothing: a whole file is finished by the completion hook."""
+
+    async def read(self, uid: str) -> bytes | None:
+        """Never asked for."""
+        return None
+
+    async def delete(self, uid: str) -> None:
+        """End the upload."""
+        principal = exchange().principal
+        assert principal is not None
+        async with self.lock(uid):
+            await asyncio.to_thread(self._delete, uid, principal)
+
+    async def read_info(self, uid: str) -> dict[str, Any] | None:
+        """What the library keeps in a side file; names stay out of it, since it logs them."""
+        upload = exchange().upload
+        if upload is None:
+            return None
+        return {
+            "metadata": {"filename": uid, "filetype": "application/octet-stream"},
+            "size": upload.size,
+            "offset": await self.size(uid),
+            "created_at": upload.created_at.isoformat(),
+            "expires": http_date(upload) if upload.state == "open" else None,
+        }
+
+    async def write_info(self, uid: str, data: dict[str, Any]) -> None:
+        """Nothing: the row and the file's size say all."""
+
+    async def list_uids(self) -> list[str]:
+        """Never asked for."""
+        return []
+
+    def location(self, uid: str) -> str:
+        """The id: what the completion hook needs."""
+        return uid
+
+    @asynccontextmanager
+    async def lock(self, uid: str) -> AsyncIterator[None]:  # type: ignore[override]
+        """Hold the upload's file. A request on it that has gone silent gives way.
+
+        Raises:
+            NotFoundError, UploadLockedError; at the end the error of a failed write.
+        """
+        upload = exchange().upload
+        if upload is not None and upload.state != "open":
+            yield
+            return
+        clock = asyncio.get_running_loop().time
+        deadline = clock() + LOCK_SECONDS
+        while (handle := self._files.try_lock(uid)) is None:
+            other = self._held.get(uid)
+            if other is not None and other.holder.silent_seconds() > TAKEOVER_SECONDS:
+                other.holder.abandon()
+            if clock() > deadline:
+                raise busy()
+            await asyncio.sleep(POLL_SECONDS)
+        held = self._held[uid] = _Held(handle, exchange())
+        try:
+            yield
+        finally:
+            del self._held[uid]
+            held.close()
+        if held.error is not None:
+            raise held.error

@@ -1,0 +1,21 @@
+"""Some of an acquisition's photos, chosen evenly or at random."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+
+def evenly(items: Sequence[Path], share: float) -> list[Path]:
+    """A share of ``items``, those left out spread evenly."""
+    count = round(share * len(items))
+    return [items[k] for k in np.floor((np.arange(count) + 0.5) * len(items) / count).astype(int)]
+
+
+def some(items: Sequence[Path], share: float, seed: int) -> list[Path]:
+    """A random share of ``items`` in their order; the same ``seed`` gives the same."""
+    count = round(share * len(items))
+    chosen = np.random.default_rng([seed, count]).choice(len(items), count, replace=False)
+    return [items[k] for k in np.sort(chosen)]

@@ -1,0 +1,165 @@
+"""One run of the pipeline, judged: what a study or a validation keeps of it."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from specimap_core.atomic import remove
+from specimap_core.errors import (
+    CancelledError,
+    DepthNotFoundError,
+    DuplicateMarkersError,
+    MarkerGeometryError,
+    MarkersMissingInCubeError,
+    NoMarkersFoundError,
+    PhotosNotConnectedError,
+    PhotoUnreadableError,
+    RegistrationError,
+    TooFewPhotosError,
+)
+from specimap_core.pipeline.clock import Progress
+from specimap_core.pipeline.outputs import Inputs
+from specimap_core.pipeline.run import run_pipeline
+from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.report.model import Quartiles, Report, Section, Spread
+from specimap_core.truth.judge import judge_with_sigma
+
+REFUSED = (
+    TooFewPhotosError,
+    PhotosNotConnectedError,
+    DepthNotFoundError,
+    NoMarkersFoundError,
+    DuplicateMarkersError,
+    MarkersMissingInCubeError,
+    MarkerGeometryError,
+    RegistrationError,
+    PhotoUnreadableError,
+)
+"""What photos or cube are refused for; anything else (a full disk, a stop) ends the whole study."""
+STAGE_SHARES = {"reconstruct": 0.5, "adjust": 0.4, "render": 0.02, "register": 0.08}
+
+
+class AgainstTruth(Section):
+    """A run's specimen pixels against truth: error median and 95th percentile, mm; coverage 0..1; ``scale``: size of
+    the result over the true one, less 1; shares of the errors within one and two stated standard deviations."""
+
+    median_mm: float
+    p95_mm: float
+    coverage: float
+    scale: float
+    within_1_sigma: float
+    within_2_sigma: float
+
+
+class Figures(Section):
+    """What is kept of a run's report, with its errors against truth where there is truth."""
+
+    photos_given: int
+    photos_used: int
+    corner_2d_mm: Spread
+    corner_3d_mm: Quartiles | None
+    leave_one_marker_out_mm: float | None
+    seconds: float
+    warnings: list[str]
+    truth: AgainstTruth | None
+
+
+class Refusal(Section):
+    """Why a run was refused."""
+
+    code: str
+    message: str
+
+
+class Outcome(Section):
+    """A run's figures, or why there are none."""
+
+    figures: Figures | None
+    refusal: Refusal | None
+
+
+def run_and_judge(
+    inputs: Inputs,
+    out: Path,
+    settings: PipelineSettings,
+    truth: Path | None,
+    *,
+    progress: Callable[[float], None],
+    cancelled: Callable[[], bool],
+) -> Outcome:
+    """Run into ``out`` and judge against the truth in the folder ``truth``; a refusal is an outcome, too.
+
+    Raises:
+        SpecimapError: leaves that tell nothing of the acquisition, ``CancelledError`` among them.
+    """
+    try:
+        report = run_pipeline(inputs, out, settings, progress=_as_one(progress), cancelled=cancelled)
+    except REFUSED as error:
+        return Outcome(figures=None, refusal=Refusal(code=error.code, message=error.message))
+    return Outcome(figures=figures_of(report, out, truth), refusal=None)
+
+
+def figures_of(report: Report, out: Path, truth: Path | None) -> Figures:
+    """The figures of a finished run in ``out``."""
+    left_out = report.leave_one_marker_out_mm
+    return Figures(
+        photos_given=report.photos.given,
+        photos_used=len(report.photos.used),
+        corner_2d_mm=report.corner_2d_mm,
+        corner_3d_mm=report.corner_3d_mm if np.isfinite(report.corner_3d_mm.median) else None,
+        leave_one_marker_out_mm=None if left_out is None else left_out.median,
+        seconds=round(sum(report.seconds.values()), 2),
+        warnings=[w.code for w in report.warnings],
+        truth=None if truth is None else _against(out, truth),
+    )
+
+
+def _against(out: Path, truth: Path) -> AgainstTruth:
+    judged = judge_with_sigma(out, truth)
+    errors = judged.errors
+    return AgainstTruth(
+        median_mm=errors.median,
+        p95_mm=errors.p95,
+        coverage=errors.coverage,
+        scale=errors.scale,
+        within_1_sigma=judged.within(1),
+        within_2_sigma=judged.within(2),
+    )
+
+
+def _as_one(progress: Callable[[float], None]) -> Progress:
+    """Progress of a whole run from that of its stages."""
+    names = list(STAGE_SHARES)
+
+    def heard(stage: str, share: float) -> None:
+        before = sum(STAGE_SHARES[name] for name in names[: names.index(stage)])
+        progress(before + STAGE_SHARES[stage] * share)
+
+    return heard
+
+
+def stopping(progress: Callable[[float], None], cancelled: Callable[[], bool]) -> Callable[[float], None]:
+    """Progress that stops what it tells of, by ``CancelledError``, where a stop was asked for."""
+
+    def told(share: float) -> None:
+        if cancelled():
+            raise CancelledError("Stopped.", advice="Run again to go on from the last finished run.")
+        progress(share)
+
+    return told
+
+
+@contextmanager
+def scratch_in(folder: Path) -> Iterator[Path]:
+    """A folder aside that is removed in the end; one that a killed run left goes at the next start."""
+    aside = folder / f".run.{uuid.uuid4().hex[:8]}.tmp"
+    aside.mkdir()
+    try:
+        yield aside
+    finally:
+        remove(aside)

@@ -1,0 +1,48 @@
+"""``python -m specimap_workers``: one worker, for one slot; ``specimap worker`` and ``specimap serve`` start it so."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+
+from specimap_core.errors import SpecimapError
+from specimap_core.sandbox import hide_from_others
+from specimap_core.sandbox.lifetime import die_with
+from specimap_infra.database import Database
+from specimap_infra.logs import logger, set_up_logs
+from specimap_infra.migrate import migrate
+from specimap_infra.settings import load_settings
+from specimap_workers.stage_process import COMMAND
+
+
+def main() -> int:
+    """Run a worker until it is stopped; 2 where it cannot start."""
+    parser = argparse.ArgumentParser(prog="python -m specimap_workers")
+    parser.add_argument("--slot", type=int, default=0)
+    parser.add_argument("--kind", choices=("cpu", "gpu"), default="cpu")
+    parser.add_argument("--parent", type=int, help="process id of the parent, to end when it ends")
+    parser.add_argument("--stage-command", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.parent is not None:
+        die_with(options.parent)
+    try:
+        settings = load_settings()
+        set_up_logs(settings)
+        hide_from_others()
+        database = Database.open(settings.database)
+        migrate(database)
+        database.close()
+        # Its imports are the slow ones: a wrong setting is told before them.
+        from specimap_workers.worker import Worker
+
+        command = shlex.split(options.stage_command) if options.stage_command else COMMAND
+        Worker(settings, slot=options.slot, kind=options.kind, command=command).run()
+    except SpecimapError as error:
+        logger().error("worker cannot work", code=error.code, message=error.message, advice=error.advice)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

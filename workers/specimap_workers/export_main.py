@@ -1,0 +1,78 @@
+"""An export's own process: makes one file of a result and ends. It needs neither database nor storage."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import resource
+import signal
+import sys
+from pathlib import Path
+from typing import cast
+
+from specimap_core.cloud import Cloud
+from specimap_core.errors import SpecimapError
+from specimap_core.export import ExportFormat, export_cloud
+from specimap_core.export.archive import write_envi_zip, write_zarr_zip
+from specimap_core.export.formats import FileFormat
+from specimap_core.json_text import json_text
+
+PR_SET_PDEATHSIG = 1
+REFUSED = 2
+"""Exit status where the error is on standard output, as JSON."""
+
+
+def make_export_file(cloud_folder: Path, format: str, target: Path) -> Path:
+    """Write a result, a folder with ``cloud.zarr``, ``mesh.ply`` and ``report.json``, to ``target`` in a format of
+    :class:`~specimap_core.export.formats.FileFormat`; whole or not at all.
+
+    Raises:
+        ValueError: there is no such format.
+        SpecimapError: as the format's own writer.
+    """
+    match FileFormat(format):
+        case FileFormat.MESH_PLY | FileFormat.MESH_STL | FileFormat.MESH_OBJ | FileFormat.MESH_GLB as mesh:
+            from specimap_core.surface.mesh_files import export_mesh, read_mesh_ply, write_mesh_ply
+
+            if mesh is FileFormat.MESH_PLY:
+                write_mesh_ply(target, read_mesh_ply(cloud_folder / "mesh.ply"))
+                return target
+            return export_mesh(cloud_folder / "mesh.ply", target, mesh.removeprefix("mesh-"))
+        case FileFormat.ZARR:
+            return write_zarr_zip(Cloud.open(cloud_folder / "cloud.zarr"), target)
+        case FileFormat.ENVI:
+            return write_envi_zip(Cloud.open(cloud_folder / "cloud.zarr"), target)
+        case (
+            FileFormat.PLY | FileFormat.LAS | FileFormat.NPZ | FileFormat.CSV | FileFormat.HTML | FileFormat.PDF
+        ) as other:
+            return export_cloud(Cloud.open(cloud_folder / "cloud.zarr"), target, cast(ExportFormat, other.value))
+
+
+def main(arguments: list[str]) -> int:
+    """The process's own part: folder, format, target, the parent's id, most bytes of memory (0: no limit)."""
+    folder, format, target, parent, memory = arguments
+    ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != int(parent):  # it ended before the line above
+        return 1
+    if int(memory):
+        resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))
+    # Libraries that print would spoil the answer.
+    answer = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    try:
+        make_export_file(Path(folder), format, Path(target))
+    except SpecimapError as error:
+        refused = error
+    except MemoryError:
+        refused = SpecimapError(
+            "The export needs more memory than it may take.", advice="Raise SPECIMAP_STAGE_MEMORY_BYTES."
+        )
+    else:
+        return 0
+    with answer:
+        answer.write(json_text(refused.as_dict()))
+    return REFUSED
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,278 @@
+"""Making the file of an export: in a process of its own, stored whole, the row written through a fence."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import IO, Any
+from uuid import uuid4
+
+import sqlalchemy as sa
+
+from specimap_core.atomic import remove
+from specimap_core.cloud.schema import ARRAYS
+from specimap_core.errors import CancelledError, NotFoundError, SpecimapError
+from specimap_core.export.formats import FileFormat, file_name
+from specimap_infra.database import Database
+from specimap_infra.errors import DatabaseUnavailableError, StageTimeoutError, WorkerCrashedError
+from specimap_infra.labels import current_labels, fingerprint
+from specimap_infra.logs import logger
+from specimap_infra.settings import ServiceSettings
+from specimap_infra.storage import Storage
+from specimap_infra.tables import CloudRow, Export
+from specimap_workers.export_main import REFUSED
+from specimap_workers.stage_process import LAST_LINES
+from specimap_workers.workspaces import Cell, Cells, is_plain
+
+DOCUMENTS = (FileFormat.HTML, FileFormat.PDF)
+POLL_SECONDS = 0.1
+HELD_SECONDS = 2.0
+"""How often a running export's row is asked whether it still is this executor's."""
+LARGEST_ANSWER = 1 << 16
+"""Bytes that are read of what the process says: it may have been taken over."""
+
+
+def run_export(
+    export_id: str,
+    database: Database,
+    storage: Storage,
+    settings: ServiceSettings,
+    executor: str,
+    cancelled: Callable[[], bool] = lambda: False,
+) -> None:
+    """Make the file of an export and finish its row. Blocks; safe to repeat, also while another still works on it.
+
+    A row that is gone, or has ended, is left alone. A process that dies is started again, up to ``settings.starts``
+    times. What goes wrong is in the row, which is then ``failed``.
+
+    Raises:
+        CancelledError: ``cancelled`` came true; the row stays as it is, for whoever takes it up.
+        DatabaseUnavailableError: the row could not be read or written.
+    """
+    export = _claim(database, export_id, executor)
+    if export is None:
+        return
+    cells = Cells.of(settings, settings.scratch, "tmp")
+    cell = cells.new(f"{export_id}-{uuid4().hex[:8]}")
+    try:
+        format = FileFormat(export.format)
+        target = cell.own / file_name(export.cloud_id, format)
+        labels_hash = _fetch(database, storage, export.cloud_id, format, cell.given)
+        _make(cells, cell, format, target, settings, lambda: _held(database, export_id, executor), cancelled)
+        # Each attempt has a place of its own: one that lost the row cannot replace the file that the row names.
+        key, size = f"exports/{export_id}/{cell.folder.stem}/{target.name}", target.stat().st_size
+        storage.put_file(key, target)
+        done = {"state": "succeeded", "storage_key": key, "size": size, "error": None, "labels_hash": labels_hash}
+        if not _finish(database, export_id, executor, done):
+            storage.delete(key)
+    except _LostError:
+        logger().warning("export lost", export=export_id)
+    except (CancelledError, DatabaseUnavailableError):
+        raise
+    except Exception as error:
+        failure = (
+            error
+            if isinstance(error, SpecimapError)
+            else SpecimapError("An error that Specimap does not know.", advice="Report it with the correlation id.")
+        )
+        logger().error("export failed", export=export_id, code=failure.code, exc_info=error)
+        described = failure.as_dict()
+        # The path of a scratch folder says nothing to a client.
+        for folder in (cell.own, cell.given, cell.folder):
+            described["message"] = str(described["message"]).replace(f"{folder}/", "")
+        _finish(database, export_id, executor, {"state": "failed", "error": described})
+    finally:
+        cell.remove()
+
+
+class _LostError(Exception):
+    """The row is another executor's now, or gone."""
+
+
+# ---- the row ------------------------------------------------------------------------------------------
+
+
+def _claim(database: Database, export_id: str, executor: str) -> Export | None:
+    open_row = sa.and_(Export.id == export_id, Export.state.in_(["queued", "running"]))
+    with database.session() as session:
+        session.execute(sa.update(Export).where(open_row).values(state="running", executor=executor))
+        return session.scalar(sa.select(Export).where(open_row))
+
+
+def _held(database: Database, export_id: str, executor: str) -> bool:
+    with database.session() as session:
+        held = sa.select(Export.id).where(
+            Export.id == export_id, Export.executor == executor, Export.state == "running"
+        )
+        return session.scalar(held) is not None
+
+
+def _finish(database: Database, export_id: str, executor: str, values: dict[str, Any]) -> bool:
+    """Write the row's end; False where it is not this executor's any more."""
+    held = sa.and_(Export.id == export_id, Export.executor == executor, Export.state == "running")
+    with database.session() as session:
+        done = session.execute(sa.update(Export).where(held).values(**values).returning(Export.id))
+        return done.first() is not None
+
+
+# ---- the file -----------------------------------------------------------------------------------------
+
+
+def _fetch(database: Database, storage: Storage, cloud_id: str, format: FileFormat, work: Path) -> str:
+    """Put what the format is made from into ``work``; the hash of the labels among it."""
+    with database.session() as session:
+        cloud = session.get(CloudRow, cloud_id)
+        labels = current_labels(session, cloud_id) if format is FileFormat.ZARR else []
+    if cloud is None:
+        raise _LostError
+    if format.startswith("mesh-"):
+        storage.fetch(f"{cloud.prefix}/mesh.ply", work / "mesh.ply")
+        return ""
+    if format in DOCUMENTS:
+        _fetch_drawn(storage, cloud.prefix, work)
+        return ""
+    storage.fetch(f"{cloud.prefix}/cloud.zarr", work / "cloud.zarr")
+    try:
+        for label in labels:
+            storage.fetch(label.storage_prefix, work / "cloud.zarr" / "labels" / label.name)
+    except NotFoundError:
+        # A layer was deleted since the rows were read. Where it was not, this ends with the error.
+        with database.session() as session:
+            if fingerprint(current_labels(session, cloud_id)) == fingerprint(labels):
+                raise
+        remove(work / "cloud.zarr")
+        return _fetch(database, storage, cloud_id, format, work)
+    return fingerprint(labels) if format is FileFormat.ZARR else ""
+
+
+def _fetch_drawn(storage: Storage, prefix: str, work: Path) -> None:
+    """What a report is drawn from: all but the spectra, which are nearly all of a cloud."""
+    for name in ("zarr.json", "spectra/zarr.json", *(array for array in ARRAYS if array != "spectra")):
+        storage.fetch(f"{prefix}/cloud.zarr/{name}", work / "cloud.zarr" / name)
+    storage.fetch(f"{prefix}/report.json", work / "report.json")
+    for name in ("photos.jpg", "preview.png"):  # older results have no photos
+        with suppress(NotFoundError):
+            storage.fetch(f"{prefix}/{name}", work / name)
+
+
+def _make(
+    cells: Cells,
+    cell: Cell,
+    format: FileFormat,
+    target: Path,
+    settings: ServiceSettings,
+    held: Callable[[], bool],
+    cancelled: Callable[[], bool],
+) -> None:
+    """Run :mod:`specimap_workers.export_main`, again where it dies.
+
+    Raises:
+        SpecimapError: what it raised there, or WorkerCrashedError, StageTimeoutError, CancelledError.
+        _LostError: the row is another's.
+    """
+    status = 0
+    for _ in range(settings.starts):
+        status, answer = _run_once(cells, cell, format, target, settings, held, cancelled)
+        if status == 0 and is_plain(cell.own):
+            return
+        if status == REFUSED:
+            error = json.loads(answer)
+            raise _RefusedError(error)
+        logger().warning("export process ended", format=format.value, status=status)
+    raise WorkerCrashedError(
+        f"The process that made the file ended with status {status}, {settings.starts} times.",
+        advice="A worker with more memory may help; the log says more.",
+        stage="export",
+        status=status,
+    )
+
+
+class _RefusedError(SpecimapError):
+    """An error of the process, as it described it."""
+
+    def __init__(self, error: dict[str, Any]) -> None:
+        super().__init__(error["message"], advice=error["advice"], **error["details"])
+        self.code = error["code"]  # type: ignore[misc]
+
+
+def _run_once(
+    cells: Cells,
+    cell: Cell,
+    format: FileFormat,
+    target: Path,
+    settings: ServiceSettings,
+    held: Callable[[], bool],
+    cancelled: Callable[[], bool],
+) -> tuple[int, str]:
+    command = [
+        sys.executable,
+        "-m",
+        "specimap_workers.export_main",
+        str(cell.given),
+        format.value,
+        str(target),
+        str(os.getpid()),
+        str(settings.stage_memory_bytes),
+    ]
+    with tempfile.TemporaryFile(dir=cell.folder) as answer, tempfile.TemporaryFile(dir=cell.folder) as said:
+        # A session of its own: a kill reaches whatever it starts, and the terminal's signals do not reach it. It holds
+        # no file of the worker's: it could empty that of the log.
+        process = subprocess.Popen(
+            cells.confined(command, cell, backends=False),
+            stdin=subprocess.DEVNULL,
+            stdout=answer,
+            stderr=said,
+            start_new_session=True,
+            env=cells.environment(cell),
+        )
+        try:
+            _wait(process, settings, held, cancelled)
+        finally:
+            if process.poll() is None:
+                with suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+        if process.returncode not in (0, REFUSED):
+            for line in _last(said).splitlines()[-LAST_LINES:]:
+                logger().error("export's last lines", line=line[:500])
+        return process.returncode, _last(answer)
+
+
+def _wait(
+    process: subprocess.Popen[bytes],
+    settings: ServiceSettings,
+    held: Callable[[], bool],
+    cancelled: Callable[[], bool],
+) -> None:
+    start = asked = time.monotonic()
+    while True:
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(POLL_SECONDS)
+            return
+        now = time.monotonic()
+        if cancelled():
+            raise CancelledError("The export was stopped.", advice="It is made when a worker takes it up again.")
+        if now - start > settings.stage_seconds:
+            raise StageTimeoutError(
+                f"The export took longer than {settings.stage_seconds:.0f} s.",
+                advice="Raise SPECIMAP_STAGE_SECONDS.",
+                stage="export",
+            )
+        if now - asked > HELD_SECONDS:
+            asked = now
+            if not held():
+                raise _LostError
+
+
+def _last(file: IO[bytes]) -> str:
+    """The end of what a process wrote."""
+    file.seek(max(0, file.seek(0, os.SEEK_END) - LARGEST_ANSWER))
+    return file.read(LARGEST_ANSWER).decode("utf-8", "replace")

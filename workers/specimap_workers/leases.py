@@ -1,0 +1,99 @@
+"""Leases: each worker says every other second that it lives; the work of one that fell silent goes to others.
+
+Lives and deaths are judged by the database's clock. A wrong judgement costs a stage run twice, never a job: the engine
+and the jobs' rows refuse what a worker writes that has lost its lease.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+import sqlalchemy as sa
+from sqlalchemy.dialects import postgresql, sqlite
+
+from specimap_infra.database import Database, database_seconds
+from specimap_infra.errors import DatabaseUnavailableError
+from specimap_infra.logs import logger
+from specimap_infra.tables import Lease
+
+
+class LeaseKeeper:
+    """Renews one worker's lease in a thread, and calls ``look_after`` now and then, where it may judge others."""
+
+    def __init__(
+        self,
+        database: Database,
+        executor: str,
+        *,
+        kind: str,
+        heartbeat_seconds: float,
+        lease_seconds: float,
+        look_after: Callable[[set[str]], None],
+    ) -> None:
+        self._database = database
+        self._executor = executor
+        self._host = executor.split(":", 1)[0]
+        self._kind = kind
+        self._heartbeat = heartbeat_seconds
+        self._ttl = lease_seconds
+        self._look_after = look_after
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="lease", daemon=True)
+
+    def start(self) -> None:
+        """Take the lease, then keep it. Raises DatabaseUnavailableError."""
+        self._renew()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Give the lease back."""
+        self._stop.set()
+        self._thread.join(timeout=10)
+        try:
+            with self._database.session() as session:
+                session.execute(sa.delete(Lease).where(Lease.executor == self._executor))
+        except DatabaseUnavailableError:
+            logger().warning("lease not given back: the database is away", executor=self._executor)
+
+    def _run(self) -> None:
+        steady: float | None = None
+        renewed = looked = time.monotonic()
+        while not self._stop.wait(self._heartbeat):
+            try:
+                self._renew()
+                now = time.monotonic()
+                # After an outage or a freeze the others may not have had their turn yet: wait a lease before judging.
+                if steady is None or now - renewed > self._ttl:
+                    steady = now
+                renewed = now
+                if now - steady >= self._ttl and now - looked >= self._ttl / 4:
+                    looked = now
+                    self._look_after(self._living())
+            except DatabaseUnavailableError:
+                steady = None
+                logger().warning("heartbeat missed: the database is away", executor=self._executor)
+            except Exception:
+                # This thread must outlive any error: without it the worker would count as dead.
+                logger().exception("looking after others failed", executor=self._executor)
+
+    def _renew(self) -> None:
+        now = database_seconds(self._database.engine)
+        values = {"executor": self._executor, "host": self._host, "kind": self._kind, "started": now, "heartbeat": now}
+        insert = sqlite.insert if self._database.engine.dialect.name == "sqlite" else postgresql.insert
+        with self._database.session() as session:
+            session.execute(
+                insert(Lease)
+                .values(**values)
+                .on_conflict_do_update(index_elements=[Lease.executor], set_={"heartbeat": now})
+            )
+
+    def _living(self) -> set[str]:
+        """Executors whose lease is live; the others' leases are removed."""
+        oldest = database_seconds(self._database.engine) - self._ttl
+        with self._database.session() as session:
+            gone = session.execute(sa.delete(Lease).where(Lease.heartbeat < oldest).returning(Lease.executor)).scalars()
+            for executor in gone:
+                logger().warning("worker is silent: its work goes to others", executor=executor)
+            return set(session.scalars(sa.select(Lease.executor)))
