@@ -7,7 +7,12 @@ from pathlib import Path
 
 import pytest
 
-pytest_plugins = ("databases", "scenes", "service_scene", "client_scene")
+pytest_plugins = (
+    "tests.support.databases",
+    "tests.support.scenes",
+    "tests.support.service_scene",
+    "tests.support.client_scene",
+)
 
 TEST_DATA_VARIABLE = "SPECIMAP_TEST_DATA"
 

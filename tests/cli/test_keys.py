@@ -1,0 +1,98 @@
+"""``specimap keys`` as a person types it, on a database that may not be there yet."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.support.service_scene import serving
+
+PROGRAM = "from specimap_cli.keys import keys_app; keys_app()"
+
+
+def keys(folder: Path, *arguments: str, database_url: str = "") -> subprocess.CompletedProcess[str]:
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("SPECIMAP_")}
+    environment |= {"SPECIMAP_DATA_DIR": str(folder), "SPECIMAP_DATABASE_URL": database_url}
+    command = [sys.executable, "-W", "error", "-c", PROGRAM, *arguments]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+
+
+def listed(folder: Path, database_url: str = "") -> list[dict[str, Any]]:
+    done = keys(folder, "list", "--json", database_url=database_url)
+    assert done.returncode == 0, done.stderr
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def test_key_is_made_before_the_first_start_and_opens_the_service(tmp_path: Path, any_database: str) -> None:
+    done = keys(
+        tmp_path, "create", "--name", "tablet 3", "--scope", "read", "--scope", "upload", database_url=any_database
+    )
+    assert done.returncode == 0, done.stderr
+    key = done.stdout.removesuffix("\n")
+    assert key.startswith("spk_")
+    assert "\n" not in key
+    assert key not in done.stderr
+    (row,) = listed(tmp_path, any_database)
+    assert {name: row[name] for name in ("name", "scopes", "state", "last_used_at")} == {
+        "name": "tablet 3",
+        "scopes": ["upload", "read"],
+        "state": "valid",
+        "last_used_at": None,
+    }
+    assert key not in json.dumps(row)
+    with serving(tmp_path, database_url=any_database) as service:
+        client = service.client(["read"])
+        client.headers["Authorization"] = f"Bearer {key}"
+        assert client.get("/v1/jobs").status_code == 200
+        assert client.get("/v1/keys").status_code == 403
+        revoked = keys(tmp_path, "revoke", str(row["id"]), database_url=any_database)
+        assert (revoked.returncode, revoked.stdout) == (0, "")
+        service.app.state.keyring.forget()
+        assert client.get("/v1/jobs").status_code == 401
+        audited = service.client().get("/v1/audit", params={"target": row["id"]}).json()["items"]
+        assert [(e["action"], e["key_id"]) for e in audited] == [("key.revoke", "cli"), ("key.create", "cli")]
+    assert listed(tmp_path, any_database)[0]["state"] == "revoked"
+
+
+def test_expiry_and_table(tmp_path: Path) -> None:
+    later = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=400)
+    done = keys(tmp_path, "create", "--name", "x" * 90, "--scope", "admin", "--expires", f"{later:%Y-%m-%d}")
+    assert done.returncode == 0, done.stderr
+    (row,) = listed(tmp_path)
+    assert row["expires_at"] == f"{later:%Y-%m-%d}T00:00:00+00:00"
+    table = keys(tmp_path, "list").stdout
+    assert str(row["id"]) in table
+    assert "x" * 90 in table
+    assert done.stdout.strip().rsplit("_", 1)[1] not in table
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["create", "--name", "a", "--scope", "root"], "root"),
+        (["create", "--name", "a"], "--scope"),
+        (["create", "--name", "", "--scope", "read"], "setting_invalid"),
+        (["create", "--name", "a", "--scope", "read", "--expires", "2020-01-01"], "has passed"),
+        (["create", "--name", "a", "--scope", "read", "--expires", "soon"], "--expires"),
+        (["revoke", "key_" + "0" * 26], "not_found"),
+    ],
+)
+def test_what_cannot_be_is_refused_with_advice(tmp_path: Path, arguments: list[str], told: str) -> None:
+    done = keys(tmp_path, *arguments)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert told in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_database_that_does_not_answer_is_told(tmp_path: Path) -> None:
+    done = keys(tmp_path, "list", database_url="postgresql://nobody@127.0.0.1:1/none")
+    assert done.returncode == 2
+    assert done.stderr.startswith("database_unavailable: ")
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,158 @@
+"""``specimap serve``, ``worker`` and ``demo`` as a person starts them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+from specimap_client import Client
+from specimap_core.cloud import Cloud
+from specimap_core.report.model import Report
+from tests.support.places import ROOT
+from tests.support.scenes import OnDisk
+from tests.support.worker_scene import processes_of, until
+
+PROGRAM = (sys.executable, "-c", "from specimap_cli import main; main()")
+
+
+@dataclass
+class Served:
+    """A program that serves, and what it has printed."""
+
+    process: subprocess.Popen[str]
+    lines: list[str] = field(default_factory=list)
+
+    def printed(self, start: str, seconds: float = 40) -> str:
+        """The rest of the line that starts so, once it is there."""
+
+        def found() -> str:
+            assert self.process.poll() is None, self.lines
+            return next((line.removeprefix(start).strip() for line in self.lines if line.startswith(start)), "")
+
+        return str(until(found, seconds, start))
+
+
+@contextmanager
+def running(folder: Path, *arguments: str, **settings: str) -> Iterator[Served]:
+    environment = {
+        **os.environ,
+        "SPECIMAP_DATA_DIR": str(folder),
+        "SPECIMAP_PORT": "0",
+        "SPECIMAP_LOG_LEVEL": "warning",
+        "SPECIMAP_LEASE_SECONDS": "4",
+        "SPECIMAP_HEARTBEAT_SECONDS": "1",
+        "SPECIMAP_MIN_FREE_BYTES": "0",
+        "PYTHONUNBUFFERED": "1",
+        **settings,
+    }
+    process = subprocess.Popen(
+        [*PROGRAM, *(arguments or ("serve",))],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    served = Served(process)
+    assert process.stdout is not None
+    reader = threading.Thread(target=lambda out=process.stdout: served.lines.extend(iter(out.readline, "")))
+    reader.start()
+    try:
+        yield served
+    finally:
+        process.kill()
+        process.wait(10)
+        reader.join(10)
+        process.stdout.close()
+
+
+def test_first_start_tells_address_and_key_and_the_second_only_the_address(tmp_path: Path) -> None:
+    with running(tmp_path / "data") as first:
+        url, key = first.printed("Specimap listens on "), "spk_" + first.printed("spk_")
+        assert url.startswith("http://127.0.0.1:")
+        with Client(url, key) as client:
+            assert [k.name for k in client.keys.list()] == ["administrator"]
+        first.process.send_signal(signal.SIGTERM)
+        assert first.process.wait(20) == 0
+        assert not processes_of(["specimap_workers", str(first.process.pid)])
+    assert (tmp_path / "data").stat().st_mode & 0o077 == 0
+    with running(tmp_path / "data") as second:
+        url = second.printed("Specimap listens on ")
+        until(lambda: httpx.get(f"{url}/readyz", trust_env=False).json()["workers"] == 1, 20, "the worker")
+        with Client(url, key) as client:
+            assert list(client.jobs.list()) == []
+        assert not any(line.startswith("spk_") for line in second.lines)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "word"),
+    [
+        ("SPECIMAP_PORT", "ninety", "SPECIMAP_PORT"),
+        ("SPECIMAP_PROT", "80", "SPECIMAP_PROT"),
+        ("SPECIMAP_STORAGE", "ftp://elsewhere", "SPECIMAP_STORAGE"),
+        ("SPECIMAP_DATABASE_URL", "mysql://elsewhere", "SPECIMAP_DATABASE_URL"),
+    ],
+)
+def test_a_wrong_setting_stops_the_start_with_a_sentence(tmp_path: Path, name: str, value: str, word: str) -> None:
+    with running(tmp_path, **{name: value}) as refused:
+        assert refused.process.wait(20) == 2
+        until(lambda: refused.lines, 5, "a sentence")
+        text = "".join(refused.lines)
+        assert word in text
+        assert "Traceback" not in text
+
+
+def test_a_port_that_is_taken_stops_the_start(tmp_path: Path) -> None:
+    with running(tmp_path / "one", "serve", "--no-worker") as first:
+        port = first.printed("Specimap listens on ").rsplit(":", 1)[1]
+        with running(tmp_path / "two", SPECIMAP_PORT=port) as second:
+            assert second.process.wait(20) == 2
+            assert "SPECIMAP_PORT" in "".join(second.lines)
+
+
+def test_no_job_is_lost_when_everything_is_killed_at_once(tmp_path: Path, small: OnDisk) -> None:
+    with running(tmp_path / "data") as first:
+        url, key = first.printed("Specimap listens on "), "spk_" + first.printed("spk_")
+        with Client(url, key) as client:
+            acquisition = client.acquisitions.create("S1")
+            client.acquisitions.upload(acquisition, photos=sorted(small.photos.glob("*.jpg")), cube=small.header)
+            jobs = [client.jobs.submit(acquisition, method=method) for method in ("camera", "homography", "camera")]
+            until(lambda: client.jobs.get(jobs[0]).stage == "adjust", 60, "the second stage")
+        first.process.kill()
+        first.process.wait(10)
+        until(lambda: not processes_of(["specimap_workers", str(first.process.pid)]), 5, "the worker's end")
+    with running(tmp_path / "data") as second, Client(second.printed("Specimap listens on "), key) as client:
+        ended = [client.jobs.wait(job, timeout=120) for job in jobs]
+        assert [job.state for job in ended] == ["succeeded"] * 3
+        began = [e for e in client.jobs.events(jobs[0]) if e.type == "progress" and e.data["progress"] == 0]
+        assert [e.data["stage"] for e in began].count("reconstruct") == 1
+        for job in ended:
+            assert job.cloud_id is not None
+            assert client.clouds.get(job.cloud_id).points > 1000
+
+
+def test_demo_runs_the_sample_through_a_service(tmp_path: Path) -> None:
+    with running(
+        tmp_path / "unused", "demo", "--out", str(tmp_path / "out"), "--samples", str(ROOT / "samples")
+    ) as demo:
+        assert demo.process.wait(180) == 0, demo.lines
+    out, text = tmp_path / "out", "".join(demo.lines)
+    report = Report.model_validate_json((out / "report.json").read_text("utf-8"))
+    assert 0.001 < report.corner_3d_mm.median < 0.1
+    cloud = Cloud.open(out / "cloud.zarr")
+    assert cloud.n_points == report.coverage.points
+    assert float(np.abs(cloud.spectra([0, 1])).max()) > 0.01
+    assert (out / "mesh.ply").stat().st_size > 100_000
+    for word in ("26 of 26 files accepted", "4 register", "report.json", "link", "/v1/clouds/cloud_"):
+        assert word in text
+    assert not processes_of([str(out / "service")])

@@ -1,0 +1,337 @@
+"""Bad photos, markers and edges: a stable code, advice, the photos named."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+
+from specimap_core.cloud import Cloud
+from specimap_core.json_text import json_text
+from specimap_core.photos.folder import photo_folder, photo_paths
+from specimap_core.photos.reading import AcquisitionSettings, read_photos
+from specimap_core.pipeline.outputs import Inputs
+from specimap_core.pipeline.run import run_pipeline
+from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.report.model import Report
+from specimap_core.truth.judge import compare_with_truth
+from tests.support.broken_sets import copied, image_of
+from tests.support.photo_files import bomb
+from tests.support.scenes import SMALL, OnDisk, phantom_on_disk, read_corners, run_refused, specimap
+
+# ---- photos ---------------------------------------------------------------------------------------------
+
+
+def test_photos_that_are_not_there(small: OnDisk, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert run_refused(tmp_path / "none", small.header, out)["code"] == "not_found"
+    (tmp_path / "bare").mkdir()
+    assert run_refused(tmp_path / "bare", small.header, out)["code"] == "too_few_photos"
+    few = copied(small.photos, tmp_path / "few", step=3)
+    refusal = run_refused(few, small.header, out)
+    assert refusal["code"] == "too_few_photos"
+    assert "6" in str(refusal["message"])
+
+
+def test_photos_that_are_all_bad(small: OnDisk, tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for k in range(8):
+        (photos / f"{k}.jpg").write_text("a letter, not a photo")
+    refusal = run_refused(photos, small.header, tmp_path / "out")
+    assert refusal["code"] == "photo_unreadable"
+    assert "0.jpg" in str(refusal["message"])
+
+
+def test_names_that_are_no_utf8_are_shown_as_far_as_they_are(small: OnDisk, tmp_path: Path) -> None:
+    """As unpacked from an archive of another system."""
+    photos = copied(small.photos, tmp_path / "photos")
+    first = min(photos.iterdir())
+    first.rename(photos / os.fsdecode(b"sch\xf6n.jpg"))
+    (photos / os.fsdecode(b"n\xe4chste.jpg")).write_text("a letter")
+    (photos / os.fsdecode(b"\xff.txt")).write_text("")
+    (photos / os.fsdecode(b"\xfe")).mkdir()
+    read, refused = read_photos(photo_paths(photos), AcquisitionSettings())
+    assert "sch\ufffdn.jpg" in {p.name for p in read}
+    assert len(read) == len(list(small.photos.iterdir()))
+    assert [(r.name, r.code) for r in refused] == [("n\ufffdchste.jpg", "photo_unreadable")]
+    said = json_text([*photo_folder(photos).remarks(), refused[0].reason], ensure_ascii=False)
+    assert said.encode("utf-8").decode().count("\ufffd") == 3
+
+
+@pytest.fixture(scope="module")
+def other(tmp_path_factory: pytest.TempPathFactory) -> OnDisk:
+    """Another layout with the same ids."""
+    return phantom_on_disk(tmp_path_factory.mktemp("other"), replace(SMALL, seed=2, bands=2))
+
+
+@pytest.fixture(scope="module")
+def stranger(tmp_path_factory: pytest.TempPathFactory) -> OnDisk:
+    """Another layout with other ids."""
+    return phantom_on_disk(tmp_path_factory.mktemp("stranger"), replace(SMALL, seed=3, marker_ids=(10, 11, 12, 13)))
+
+
+@pytest.mark.parametrize("second", ["other", "stranger"])
+def test_two_scenes(small: OnDisk, second: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    scene: OnDisk = request.getfixturevalue(second)
+    photos = copied(small.photos, tmp_path / "photos", stem="a_", step=2)
+    copied(scene.photos, photos, stem="b_", step=2)
+    refusal = run_refused(photos, small.header, tmp_path / "out")
+    assert refusal["code"] == "photos_not_connected"
+    details = refusal["details"]
+    assert isinstance(details, dict)
+    names = details["photos"]
+    assert len({n[0] for n in names}) == 1  # those of one scene, wholly
+    assert len(names) == 6
+
+
+@pytest.fixture
+def shallow(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path, OnDisk], dict[str, str]]:
+    """Pose photos without measuring depth; returns the code of each photo that was refused, by name."""
+    from specimap_core.photos.folder import photo_paths
+    from specimap_core.photos.reading import AcquisitionSettings, read_photos
+    from specimap_core.reconstruct.backend import ReconstructSettings, corners_in_photos, detect_in_photos
+    from specimap_core.reconstruct.backends import colmap
+
+    monkeypatch.setattr(colmap, "measure_depth", lambda *_, **__: ([], ()))
+
+    def pose(folder: Path, phantom: OnDisk) -> dict[str, str]:
+        photos, refused = read_photos(photo_paths(folder), AcquisitionSettings())
+        settings = ReconstructSettings()
+        found = detect_in_photos(photos, settings.dictionary, workers=2, progress=lambda _: None)
+        corners = corners_in_photos(photos, found, settings.dictionary)
+        answer = colmap.ColmapBackend().reconstruct(photos, corners, settings, workers=2, progress=lambda _: None)
+        # Those that are used lie where the truth says: distances between them, which need no common frame.
+        views = {Path(n).name: v for n, v in zip(phantom.truth.photo_names, phantom.truth.views, strict=True)}
+        posed = [(photos[p].name, pose.centre) for p, pose in zip(answer.photos, answer.poses, strict=True)]
+        known = [(views[n].cam_from_world.centre, c) for n, c in posed if n in views]
+        true, got = (np.stack(c) for c in zip(*known, strict=True))
+        gaps = [np.linalg.norm(c[:, None] - c[None], axis=-1) for c in (true, got)]
+        assert np.abs(gaps[0] - gaps[1]).max() < 0.05 * gaps[0].max()
+        return {r.name: r.code for r in [*refused, *answer.refused]}
+
+    return pose
+
+
+Pose = Callable[[Path, OnDisk], dict[str, str]]
+
+
+def test_a_few_foreign_and_bad_photos_are_refused_by_name(
+    small: OnDisk, other: OnDisk, stranger: OnDisk, shallow: Pose, tmp_path: Path
+) -> None:
+    photos = copied(small.photos, tmp_path / "photos")
+    shutil.copy(sorted(other.photos.iterdir())[3], photos / "other.jpg")
+    shutil.copy(sorted(stranger.photos.iterdir())[3], photos / "stranger.jpg")
+    shutil.copy(sorted(small.photos.iterdir())[0], photos / "again.jpg")
+    (photos / "letter.jpg").write_text("a letter")
+    whole = sorted(small.photos.iterdir())[1].read_bytes()
+    (photos / "cut.jpg").write_bytes(whole[: len(whole) // 3])
+    bomb(photos / "bomb.png")
+    refused = shallow(photos, small)
+    assert refused.pop("stranger.jpg") in ("photo_foreign", "photo_unlocated")
+    # Of two copies the one that comes first by name stays.
+    assert refused == {
+        "other.jpg": "photo_foreign",
+        "view_000.jpg": "photo_duplicate",
+        "letter.jpg": "photo_unreadable",
+        "cut.jpg": "photo_unreadable",
+        "bomb.png": "photo_unreadable",
+    }
+
+
+def without_markers(path: Path, phantom: OnDisk) -> None:
+    """Paint grey over the cards in a photo."""
+    image = cv2.imread(str(path))
+    assert image is not None
+    names = [Path(n).name for n in phantom.truth.photo_names]
+    view = phantom.truth.views[names.index(path.name)]
+    for corners in phantom.truth.marker_corners:
+        middle = corners.mean(0)
+        card = np.round(view.project(middle + 1.3 * (corners - middle))).astype(np.int32)
+        cv2.fillConvexPoly(image, card, (120, 120, 120))
+    cv2.imwrite(str(path), image, [cv2.IMWRITE_JPEG_QUALITY, 95])
+
+
+def test_photos_without_a_marker_are_located_by_features(small: OnDisk, shallow: Pose, tmp_path: Path) -> None:
+    photos = copied(small.photos, tmp_path / "photos")
+    for name in ("view_003.jpg", "view_011.jpg"):
+        without_markers(photos / name, small)
+    refused = shallow(photos, small)  # checks poses against truth
+    assert len(refused) <= 1
+    assert set(refused.values()) <= {"photo_unlocated"}
+
+
+def test_a_blurred_photo_is_located_or_refused_by_name(small: OnDisk, shallow: Pose, tmp_path: Path) -> None:
+    photos = copied(small.photos, tmp_path / "photos")
+    image = cv2.imread(str(photos / "view_005.jpg"))
+    assert image is not None
+    cv2.imwrite(str(photos / "view_005.jpg"), cv2.GaussianBlur(image, (0, 0), 9))
+    assert shallow(photos, small) in ({}, {"view_005.jpg": "photo_blurred"})
+
+
+def test_photos_held_both_ways_are_all_used(small: OnDisk, shallow: Pose, tmp_path: Path) -> None:
+    """Portrait and landscape of one camera; the phantom's square photos are cut to show it."""
+    photos = copied(small.photos, tmp_path / "photos")
+    for k, path in enumerate(sorted(photos.iterdir())):
+        image = cv2.imread(str(path))
+        assert image is not None
+        cut = image[24:360]  # 336 x 384
+        cv2.imwrite(str(path), np.ascontiguousarray(np.rot90(cut)) if k % 3 == 0 else cut)
+    assert shallow(photos, small) == {}
+
+
+def test_photos_of_every_format_and_turn_are_used(small: OnDisk, shallow: Pose, tmp_path: Path) -> None:
+    """A folder as several programs leave it: each photo in a format of its own, turned as EXIF says."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    kinds = [(".jpg", 1), (".tif", 6), (".heic", 8), (".webp", 3), (".avif", 6), (".png", 8), (".TIFF", 8), (".HIF", 6)]
+    back = {1: 0, 3: 2, 6: 1, 8: 3}
+    for k, path in enumerate(sorted(small.photos.iterdir())):
+        suffix, orientation = kinds[k % len(kinds)]
+        cut = image_of(path)[24:360, :, ::-1]  # 336 x 384
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = orientation
+        stored = Image.fromarray(np.ascontiguousarray(np.rot90(cut, back[orientation])))
+        lossy = {} if suffix.lower() in (".tif", ".tiff", ".png") else {"quality": 95}
+        kind = {".hif": "HEIF", ".tiff": "TIFF"}.get(suffix.lower())
+        # Under its own name, so that the truth is found.
+        stored.save(folder / f"{path.name}{suffix}", kind, exif=exif.tobytes(), **lossy)
+    names = [f"{name}{kinds[k % len(kinds)][0]}" for k, name in enumerate(small.truth.photo_names)]
+    named = replace(small.truth, photo_names=names)
+    assert shallow(folder, OnDisk(small.folder, named)) == {}
+
+
+def test_two_resolutions_of_one_phone_are_all_used(small: OnDisk, shallow: Pose, tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for k, path in enumerate(sorted(small.photos.iterdir())):
+        exif = Image.Exif()
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = 60
+        with Image.open(path) as image:
+            size = (288, 288) if k % 2 else image.size
+            image.resize(size, Image.Resampling.BOX).save(folder / path.name, quality=95, exif=exif)
+    assert shallow(folder, small) == {}
+
+
+# ---- markers --------------------------------------------------------------------------------------------
+
+
+def test_no_marker_anywhere(small: OnDisk, tmp_path: Path) -> None:
+    photos = copied(small.photos, tmp_path / "photos")
+    for path in photos.iterdir():
+        without_markers(path, small)
+    assert run_refused(photos, small.header, tmp_path / "out")["code"] == "no_markers_found"
+
+
+def test_mirrored_photos_are_said_to_be_mirrored(small: OnDisk, tmp_path: Path) -> None:
+    """As a phone's front camera stores them."""
+    photos = copied(small.photos, tmp_path / "photos")
+    for path in photos.iterdir():
+        cv2.imwrite(str(path), image_of(path)[:, ::-1])
+    refusal = run_refused(photos, small.header, tmp_path / "out")
+    assert refusal["code"] == "no_markers_found"
+    assert "mirrored" in str(refusal["message"])
+
+
+@pytest.mark.parametrize("given", ["DICT_5X5_50", "DICT_6X6_1000", "DICT_APRILTAG_16h5", "DICT_7X7_1000"])
+def test_markers_of_another_dictionary(small: OnDisk, tmp_path: Path, given: str) -> None:
+    refusal = run_refused(small.photos, small.header, tmp_path / "out", "--dictionary", given)
+    assert refusal["code"] == "marker_dictionary_wrong"
+    assert "DICT_4X4_1000" in str(refusal["advice"])
+
+
+def test_a_layout_of_one_marker_is_refused_at_the_cube(tmp_path: Path) -> None:
+    phantom = phantom_on_disk(tmp_path, replace(SMALL, marker_ids=(5,), bands=4))
+    refusal = run_refused(phantom.photos, phantom.header, tmp_path / "out")
+    assert refusal["code"] == "markers_missing_in_cube"
+
+
+def test_other_layouts_work(tmp_path: Path) -> None:
+    """Nine markers of another dictionary and edge."""
+    settings = replace(
+        SMALL, marker_ids=tuple(range(20, 29)), dictionary="DICT_6X6_250", edge_mm=10.0, bands=4, photo_size=512
+    )
+    phantom = phantom_on_disk(tmp_path, settings)
+    pipeline = PipelineSettings()
+    pipeline = replace(
+        pipeline,
+        reconstruct=replace(pipeline.reconstruct, dictionary="DICT_6X6_250", edge_mm=10.0),
+        adjust=replace(pipeline.adjust, edge_mm=10.0),
+    )
+    report = run_pipeline(Inputs(phantom.photos, phantom.header), tmp_path / "out", pipeline)
+    ids, corners = read_corners(tmp_path / "out")
+    assert len(ids) >= 8
+    cloud = Cloud.open(tmp_path / "out" / "cloud.zarr")
+    true_corners = phantom.truth.marker_corners[[list(settings.marker_ids).index(i) for i in ids]]
+    against = compare_with_truth(
+        cloud.hsi_pixel,
+        cloud.xyz,
+        corners,
+        true_corners,
+        phantom.truth.hsi_xyz.astype(float),
+        phantom.truth.hsi_class == 1,
+    )
+    assert 0.01 < against.median < 0.4
+    assert abs(against.scale) < 0.005
+    assert report.edge_length_mm.mean == pytest.approx(10, rel=0.01)
+
+
+# ---- scale ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("edge", "named"),
+    [(0.3, "0.3 inches are 7.62 mm"), (0.268, "0.268 inches"), (0.68, "0.68 centimetres are 6.8 mm")],
+)
+def test_an_edge_in_another_unit_is_refused(
+    small: OnDisk, tmp_path: Path, edge: float, named: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The unit's own range is not what is asked for here.
+    from specimap_core.pipeline import limits
+
+    monkeypatch.setitem(limits.RANGES, "edge_mm", (0.01, 1000.0))
+    refusal = run_refused(small.photos, small.header, tmp_path / "out", "--edge-mm", edge)
+    assert refusal["code"] == "edge_implausible"
+    assert named in str(refusal["advice"])
+    assert refusal["details"]["distance_mm"] == pytest.approx(150 * edge / 6.8, rel=0.1)  # type: ignore[index]
+
+
+def test_an_edge_far_too_large_is_refused(small: OnDisk, tmp_path: Path) -> None:
+    refusal = run_refused(small.photos, small.header, tmp_path / "out", "--edge-mm", 180)
+    assert refusal["code"] == "edge_implausible"
+    assert "4.0 m" in str(refusal["message"])
+
+
+def with_subject(photos: Path, folder: Path, metres: float) -> Path:
+    """Copies of photos whose EXIF states a distance."""
+    folder.mkdir()
+    for path in photos.iterdir():
+        with Image.open(path) as image:
+            exif = Image.Exif()
+            exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.SubjectDistance] = metres
+            image.save(folder / path.name, quality=95, exif=exif)
+    return folder
+
+
+def test_an_edge_that_exif_and_reason_contradict_is_refused(small: OnDisk, tmp_path: Path) -> None:
+    photos = with_subject(small.photos, tmp_path / "photos", 0.15)
+    refusal = run_refused(photos, small.header, tmp_path / "out", "--edge-mm", 68)
+    assert refusal["code"] == "edge_implausible"
+    assert "EXIF says 150 mm" in str(refusal["message"])
+
+
+def test_a_doubtful_edge_is_warned_of(small: OnDisk, tmp_path: Path) -> None:
+    photos = with_subject(small.photos, tmp_path / "photos", 0.4)
+    answer = specimap(
+        "run", "--photos", photos, "--cube", small.header, "--out", tmp_path / "out", "--edge-mm", 68, "--json"
+    )
+    assert answer.status == 0
+    report = Report.model_validate(answer.events[-1]["report"])
+    assert {"scale_implausible", "scale_contradicts_exif"} <= {w.code for w in report.warnings}

@@ -1,0 +1,230 @@
+"""The cube's camera settled: by markers where they hold it, by the specimen elsewhere, and what is said of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from specimap_core.cloud import Cloud, Flag
+from specimap_core.cube import open_cube
+from specimap_core.geometry.cameras import fit_similarity
+from specimap_core.pipeline.outputs import Inputs
+from specimap_core.pipeline.register_stage import corners_in_cube
+from specimap_core.pipeline.run import run_pipeline
+from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.register.accuracy import CornersInCube
+from specimap_core.register.camera_refinement import LOOSE_MM, Settled, settle_camera
+from specimap_core.register.cube_camera import CubeCamera, solve_camera
+from specimap_core.register.cube_markers import CubeMarkers, find_markers
+from specimap_core.register.specimen_motion import SHARED_MM
+from specimap_core.report.model import Report
+from specimap_core.surface.raycast import RayCaster
+from specimap_core.truth.judge import judge, judge_with_sigma
+from specimap_validation.phantom import PhantomSettings, load_truth
+from specimap_validation.phantom.render import CLASS_SPECIMEN
+from tests.support.moved_specimen import (
+    CORNERS,
+    LARGER,
+    TOLERANCE_MM,
+    VIEW,
+    moved_by,
+    seen,
+    stage2_of,
+    textured,
+    turned,
+)
+from tests.support.reruns import codes, rerun
+from tests.support.scenes import Finished, OnDisk, bump_mesh, phantom_on_disk
+
+ROWS, COLS = VIEW.intrinsics.height, VIEW.intrinsics.width
+SHARP_PX, BLURRED_PX = 0.02, 0.5
+ALL, THREE = (0, 1, 2, 3), (0, 1, 2)
+SEEDS = range(8)
+RAISED_MM = 1.5
+MOVED_MM = (0.8, -0.5, 0.0)
+Image = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A camera by the markers ``alone``, and ``settled``; how far the textured bump is off in either, mm."""
+
+    alone: CubeCamera
+    settled: Settled
+    before_mm: float
+    after_mm: float
+
+
+@pytest.fixture(scope="module")
+def caster() -> RayCaster:
+    return RayCaster(textured())
+
+
+@pytest.fixture(scope="module")
+def picture(caster: RayCaster) -> Image:
+    return seen(caster.mesh)
+
+
+def off_mm(camera: CubeCamera) -> float:
+    """How far the raised part of the bump shows from where it should, sideways, root mean square."""
+    vertices = bump_mesh().vertices.astype(float)
+    raised = vertices[vertices[:, 2] > RAISED_MM]
+    miss = camera.view.project(raised) - VIEW.project(raised)
+    return float(np.sqrt((miss**2).sum(1).mean())) * camera.pixel_mm
+
+
+def case(image: Image, caster: RayCaster, ids: tuple[int, ...], noise_px: float, seed: int) -> Case:
+    """The markers ``ids`` with noise on their corners, and the cube's image of the bump."""
+    noise = np.random.default_rng(seed).normal(0, noise_px, (len(CORNERS), 4, 2))
+    pixels = (VIEW.project(CORNERS.reshape(-1, 3)).reshape(-1, 4, 2) + noise)[list(ids)]
+    sigma = np.full(len(ids), noise_px)
+    corners = CornersInCube(ids, CORNERS[list(ids)], pixels, sigma)
+    found = CubeMarkers(ids, pixels, sigma, image, "band mean", False)
+    alone = solve_camera(*corners.flat(), ROWS, COLS)
+    settled = settle_camera(corners, found, ROWS, COLS, caster, CORNERS)
+    return Case(alone, settled, off_mm(alone), off_mm(settled.camera))
+
+
+# ---- markers, and a textured bump ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_four_sharp_markers_hold_the_camera_and_the_specimen_agrees(
+    caster: RayCaster, picture: Image, seed: int
+) -> None:
+    found = case(picture, caster, ALL, SHARP_PX, seed)
+    settled = found.settled
+    assert settled.by_specimen
+    assert settled.remarks() == []
+    assert settled.shift is not None
+    assert not settled.shift.significant
+    assert 0 < settled.sideways_mm < settled.open_mm < LOOSE_MM
+    assert 0.001 < found.after_mm < 2 * settled.sideways_mm
+
+
+@pytest.mark.parametrize("ids", [ALL, THREE])
+def test_what_markers_leave_open_the_specimen_settles(caster: RayCaster, picture: Image, ids: tuple[int, ...]) -> None:
+    cases = [found for seed in SEEDS if (found := case(picture, caster, ids, BLURRED_PX, seed)).settled.by_specimen]
+    # Corners that are off by chance hide at times how far: not every draw is recognised as loose.
+    assert len(cases) >= 6
+    for found in cases:
+        settled = found.settled
+        assert settled.shift is not None
+        assert found.after_mm < min(found.before_mm, 3 * settled.shift.sigma_mm)
+        # Two measurements of one place are together surer than either.
+        assert SHARED_MM / 2 < settled.sideways_mm < min(settled.open_mm, settled.shift.sigma_mm)
+        assert settled.remarks() == []
+    before, after = (float(np.median(m)) for m in zip(*((c.before_mm, c.after_mm) for c in cases), strict=True))
+    assert before > LOOSE_MM
+    assert 0.002 < after < 2 * SHARED_MM
+
+
+def test_what_nothing_settles_is_said(caster: RayCaster, picture: Image) -> None:
+    blank = np.full_like(picture, 0.5)
+    flat = RayCaster(bump_mesh(height_mm=0.1))
+    for image, surface, seed in [(blank, caster, 0), (blank, caster, 1), (seen(flat.mesh), flat, 0)]:
+        found = case(image, surface, ALL, 2 * BLURRED_PX, seed)
+        assert [code for code, _ in found.settled.remarks()] == ["cube_camera_loose"]
+        assert not found.settled.by_specimen
+        assert found.settled.shift is None
+        assert found.settled.sideways_mm >= found.settled.open_mm > LOOSE_MM
+        assert f"{found.settled.sideways_mm:.1f} mm" in found.settled.remarks()[0][1]
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_moved_specimen_does_not_draw_the_camera_along(caster: RayCaster, seed: int) -> None:
+    image = seen(moved_by(caster.mesh, turned(0.0, np.array(MOVED_MM))))
+    moved = float(np.hypot(*MOVED_MM[:2]))
+    for noise_px in (SHARP_PX, BLURRED_PX):
+        found = case(image, caster, ALL, noise_px, seed)
+        assert not found.settled.by_specimen
+        assert found.after_mm == found.before_mm
+        # A motion is no fault of the camera's.
+        loose = ["cube_camera_loose"] if found.settled.camera_mm > LOOSE_MM else []
+        assert [code for code, _ in found.settled.remarks()] == ["specimen_moved", *loose]
+        assert noise_px > SHARP_PX or not loose
+        # What the camera itself is off by is part of what is seen of the motion.
+        assert found.settled.sideways_mm == pytest.approx(moved, abs=found.before_mm + SHARED_MM)
+
+
+# ---- whole runs ---------------------------------------------------------------------------------------
+
+
+def resolved(folder: Path) -> tuple[float, float, Settled]:
+    """How far the specimen's true places show from their pixels, sideways, mm: by the run's markers alone, and settled
+    as in its stage 4."""
+    truth, stage2, cube = load_truth(folder), stage2_of(folder / "out"), open_cube(folder / "hsi" / "hsi.hdr")
+    adjusted = stage2.adjusted
+    found = find_markers(cube, "DICT_4X4_50", adjusted.marker_ids)
+    corners = corners_in_cube(found, adjusted, cube.cols)
+    alone = solve_camera(*corners.flat(), cube.rows, cube.cols)
+    settled = settle_camera(corners, found, cube.rows, cube.cols, RayCaster(stage2.mesh), adjusted.corners)
+    true_corners = truth.marker_corners[[list(truth.marker_ids).index(i) for i in adjusted.marker_ids]]
+    _, R, t = fit_similarity(true_corners.reshape(-1, 3), adjusted.corners.reshape(-1, 3))
+    pixels = np.argwhere(truth.hsi_class == CLASS_SPECIMEN)
+    places = truth.hsi_xyz[pixels[:, 0], pixels[:, 1]].astype(float) @ R.T + t
+
+    def off(camera: CubeCamera) -> float:
+        miss = camera.view.project(places) - pixels[:, ::-1]
+        return float(np.sqrt((miss**2).sum(1).mean())) * camera.pixel_mm
+
+    return off(alone), off(settled.camera), settled
+
+
+def test_a_run_with_two_markers_in_the_cube_is_settled(finished: Finished, small: OnDisk, tmp_path: Path) -> None:
+    report = rerun(finished, small, tmp_path, LARGER, (1, 3))
+    assert report.marker_ids_in_cube == [0, 2]
+    assert "markers_missing_in_cube" in codes(report)
+    assert not codes(report) & {"specimen_moved", "cube_camera_loose"}
+    before, after, settled = resolved(tmp_path)
+    assert settled.by_specimen
+    assert settled.open_mm > LOOSE_MM
+    assert settled.shift is not None
+    assert 0.003 < after < min(before, 3 * settled.shift.sigma_mm)
+    assert report.cube_camera.focal_px == pytest.approx(settled.camera.view.intrinsics.focal_px, rel=1e-3)
+    # Half the markers, and the places are about as good as with all of them.
+    error, usual = judge_with_sigma(tmp_path / "out", tmp_path).errors, judge(finished.out, small.folder)
+    assert 0.02 < error.median < 1.3 * usual.median
+
+
+def test_a_run_states_that_the_specimen_moved_and_how_unsure_its_places_are(
+    finished: Finished, small: OnDisk, tmp_path: Path
+) -> None:
+    moved = float(np.hypot(*MOVED_MM[:2]))
+    report = rerun(finished, small, tmp_path, replace(LARGER, moved_mm=MOVED_MM), ())
+    assert "specimen_moved" in codes(report)
+    cloud = Cloud.open(tmp_path / "out" / "cloud.zarr")
+    stated = cloud.sigma_mm[(cloud.flags & Flag.SPECIMEN) > 0]
+    # The motion itself is measured, within the small phantom's own error.
+    assert stated.min() >= moved - TOLERANCE_MM
+    assert report.sigma_mm.median == pytest.approx(moved, abs=TOLERANCE_MM)
+    judged = judge_with_sigma(tmp_path / "out", tmp_path)
+    assert judged.errors.median == pytest.approx(moved, abs=TOLERANCE_MM)
+    # All points are off by about the one stated deviation; on flanks, where the motion turns into height, by more.
+    assert judged.within(0.5) < 0.05
+    assert judged.within(2) > 0.9
+
+
+@pytest.fixture(scope="module")
+def blurred(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Report]:
+    """A run on photos so blurred that one marker is read in none of them."""
+    folder = tmp_path_factory.mktemp("blurred")
+    phantom = phantom_on_disk(folder, PhantomSettings(seed=21, blur_px=1.5, bands=4))
+    return folder, run_pipeline(Inputs(phantom.photos, phantom.header), folder / "out", PipelineSettings())
+
+
+def test_a_run_on_blurred_photos_is_settled(blurred: tuple[Path, Report]) -> None:
+    folder, report = blurred
+    assert len(report.marker_ids_in_cube) == 3
+    assert not codes(report) & {"specimen_moved", "cube_camera_loose"}
+    before, after, settled = resolved(folder)
+    assert settled.by_specimen
+    assert settled.shift is not None
+    # The specimen has more to say than the corners.
+    assert settled.open_mm > settled.shift.sigma_mm
+    assert 0.003 < after < min(before, 3 * settled.shift.sigma_mm)
+    assert 0.3 * after < settled.sideways_mm < LOOSE_MM

@@ -1,0 +1,252 @@
+"""Cubes of other cameras than a frame camera with square pixels: recognised, registered, and what is said of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from specimap_core.errors import RegistrationError, SpecimapError
+from specimap_core.geometry.cameras import Intrinsics, View, look_at
+from specimap_core.geometry.pushbroom import Axis, ScanView
+from specimap_core.register.accuracy import on_plane
+from specimap_core.register.camera_fitting import Sight, refit
+from specimap_core.register.camera_models import FRAME
+from specimap_core.register.cube_camera import CubeCamera, solve_camera
+from specimap_core.register.model_selection import Choice, choose_camera
+from specimap_core.register.stripes import without_stripes
+from specimap_core.register.tile_offsets import Sighting
+from specimap_core.report.model import Report
+from specimap_core.truth.judge import Judged, judge_with_sigma
+from tests.support.moved_specimen import CORNERS, LARGER
+from tests.support.reruns import codes, rerun
+from tests.support.scenes import Finished, OnDisk
+
+ROWS, COLS = 256, 320
+SHARP_PX = 0.02
+NOTHING = np.empty((0, 3))
+RAISED = np.random.default_rng(1).uniform([-12, -12, 5], [12, 12, 12], (100, 3))
+
+
+def unseen(view: View) -> Sighting | None:
+    """No specimen is found through any camera."""
+    del view
+    return None
+
+
+def square_camera(sight: Sight) -> CubeCamera | None:
+    try:
+        return solve_camera(sight.corners, sight.pixels, sight.sigma_px, ROWS, COLS)
+    except RegistrationError:
+        return None
+
+
+def by_corners(view: View, noise_px: float, seed: int, ids: tuple[int, ...] = (0, 1, 2, 3)) -> Choice:
+    """What corners with noise alone say of ``view``."""
+    corners = CORNERS[list(ids)].reshape(-1, 3)
+    pixels = view.project(corners) + np.random.default_rng(seed).normal(0, noise_px, (len(corners), 2))
+    sight = Sight(corners, pixels, np.full(len(corners), max(noise_px, SHARP_PX)))
+    return choose_camera(sight, ROWS, COLS, square_camera(sight), RAISED, unseen)
+
+
+def above(aspect: float = 1.0, tilt_mm: float = 8.0) -> View:
+    lens = replace(Intrinsics.centred(COLS, ROWS, 1600.0), aspect=aspect)
+    return View(lens, look_at(np.array([tilt_mm, -tilt_mm, 400]), np.zeros(3), np.array([0, 1.0, 0])))
+
+
+# ---- corners alone ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tilt_mm", [0.0, 8.0, 60.0])
+@pytest.mark.parametrize("noise_px", [0.02, 0.5])
+def test_square_pixels_are_left_square(noise_px: float, tilt_mm: float) -> None:
+    assert {by_corners(above(tilt_mm=tilt_mm), noise_px, seed).model for seed in range(6)} == {FRAME}
+
+
+@pytest.mark.parametrize("aspect", [0.3, 0.7, 0.97, 1.03, 1.4, 3.0])
+@pytest.mark.parametrize("ids", [(0, 1, 2, 3), (0, 1, 2), (0, 2)])
+def test_the_aspect_shows_in_the_corners(aspect: float, ids: tuple[int, ...]) -> None:
+    for seed in range(3):
+        choice = by_corners(above(aspect), SHARP_PX, seed, ids)
+        assert choice.model is not FRAME
+        camera = choice.fit.camera
+        assert camera.view.intrinsics.aspect == pytest.approx(aspect, rel=0.01)
+        assert not choice.by_specimen
+        # Kinds that the corners do not tell apart, and all tilts that they allow, are in what is stated.
+        off = (camera.view.project(RAISED) - above(aspect).project(RAISED)) * camera.span_mm
+        stated = float(np.hypot(choice.alone.camera.sideways_mm(RAISED), choice.open_mm))
+        assert stated > 0.005
+        assert float(np.sqrt((off**2).sum(1).mean())) < 3 * stated
+
+
+def test_pixels_that_nobody_makes_are_refused_with_their_aspect() -> None:
+    for aspect in (0.15, 6.0):
+        with pytest.raises(RegistrationError, match=f"{aspect:.2f} times as high") as refused:
+            by_corners(above(aspect), SHARP_PX, 0)
+        assert "0.25 and 4" in refused.value.advice
+
+
+@pytest.mark.parametrize("axis", ["rows", "columns"])
+def test_a_marker_left_out_of_a_scan_is_placed_by_the_others(axis: Axis) -> None:
+    frame = above(0.8)
+    view = ScanView(frame.intrinsics, frame.cam_from_world, axis, 0.01, 0.0, 400.0)
+    flat = CORNERS[:3].reshape(-1, 3)
+    away = np.array([1.0, -2.0])
+    moved = refit(view, flat, view.project(flat) + away, np.full(12, SHARP_PX))
+    left_out = CORNERS[3]
+    miss = on_plane(moved, view.project(left_out) + away, left_out[:, 2]) - left_out[:, :2]
+    assert np.abs(miss).max() < 0.01
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.floats(0.1, 8.0),
+    st.floats(-0.6, 0.6),
+    st.floats(-0.6, 0.6),
+    st.floats(0.0, 6.3),
+    st.booleans(),
+    st.sampled_from([(0, 1, 2, 3), (0, 1, 2), (0, 1), (3,)]),
+    st.sampled_from([0.0, 0.02, 3.0]),
+)
+def test_whatever_the_corners_show_ends_in_a_camera_or_a_refusal(
+    aspect: float, x: float, y: float, turn: float, mirrored: bool, ids: tuple[int, ...], noise_px: float
+) -> None:
+    lens = replace(Intrinsics.centred(COLS, ROWS, 1600.0), aspect=aspect)
+    eye = 400 * np.array([x, y, 1.0])
+    view = View(lens, look_at(eye, np.zeros(3), np.array([np.cos(turn), np.sin(turn), 0.0])))
+    corners = CORNERS[list(ids)].reshape(-1, 3)
+    pixels = view.project(corners) + np.random.default_rng(0).normal(0, noise_px, (len(corners), 2))
+    if mirrored:
+        pixels[:, 0] = COLS - 1 - pixels[:, 0]
+    sight = Sight(corners, pixels, np.full(len(corners), SHARP_PX))
+    try:
+        choice = choose_camera(sight, ROWS, COLS, square_camera(sight), NOTHING, unseen)
+    except SpecimapError:
+        return
+    assert np.isfinite(choice.fit.camera.view.project(corners)).all()
+    assert np.isfinite([choice.open_mm, choice.unfit_mm, choice.fit.cost]).all()
+
+
+# ---- dead columns and lines ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [0.0, 1e6, np.nan])
+def test_dead_columns_and_lines_are_bridged_and_nothing_else(value: float) -> None:
+    rng = np.random.default_rng(0)
+    rows, cols = np.indices((120, 160))
+    smooth = 0.5 + 0.2 * np.sin(cols / 9) * np.cos(rows / 7)
+    clean = (smooth + 0.01 * rng.standard_normal(rows.shape)).astype(np.float32)
+    clean[20:60, 30:70] = 0.05
+    assert (without_stripes(clean) == clean).all()
+    dead = clean.copy()
+    dead[:, [0, 80, 81, 82, 159]] = value
+    dead[50:53] = value
+    bridged = without_stripes(dead)
+    touched = np.zeros(clean.shape, bool)
+    touched[:, [0, 80, 81, 82, 159]] = touched[50:53] = True
+    assert np.abs(bridged - clean)[touched].max() < 0.6
+    assert np.median(np.abs(bridged - clean)[touched]) < 0.05
+    assert (bridged[~touched] == clean[~touched]).all()
+
+
+# ---- whole runs ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Cube:
+    """What is changed of the phantom's cube, the kind that it is then of, its aspect and what is said of it."""
+
+    change: dict[str, object]
+    model: str
+    aspect: float = 1.0
+    said: frozenset[str] = frozenset()
+
+
+NOT_FRAME, NOT_SQUARE = "cube_camera_not_frame", "cube_pixels_not_square"
+OURS = {NOT_FRAME, NOT_SQUARE, "cube_camera_unfit", "cube_camera_loose", "specimen_moved"}
+CUBES = {
+    "square": Cube({}, "frame"),
+    "lines of 0.7": Cube({"cube_aspect": 0.7, "cube_rows": 366}, "frame", 0.7, frozenset({NOT_SQUARE})),
+    "lines of 1.4": Cube({"cube_aspect": 1.4, "cube_rows": 183}, "frame", 1.4, frozenset({NOT_SQUARE})),
+    "scan of rows": Cube({"cube_scan": "rows"}, "scan_rows", 1.0, frozenset({NOT_FRAME})),
+    "scan of columns": Cube({"cube_scan": "columns"}, "scan_columns", 1.0, frozenset({NOT_FRAME})),
+    "slow scan": Cube(
+        {"cube_scan": "rows", "cube_aspect": 1.03, "cube_rows": 249},
+        "scan_rows",
+        1.03,
+        frozenset({NOT_FRAME, NOT_SQUARE}),
+    ),
+    "scan aslant": Cube({"cube_scan": "rows", "scan_pitch_deg": 10.0}, "scan_rows", 1.0, frozenset({NOT_FRAME})),
+}
+
+
+def run_on(
+    cube: Cube, finished: Finished, small: OnDisk, folder: Path, hidden: tuple[int, ...] = ()
+) -> tuple[Report, Judged]:
+    changed = replace(LARGER, **cube.change)  # type: ignore[arg-type]
+    report = rerun(finished, small, folder, changed, hidden)
+    return report, judge_with_sigma(folder / "out", folder)
+
+
+@pytest.fixture(scope="module")
+def plain_mm(finished: Finished, small: OnDisk, tmp_path_factory: pytest.TempPathFactory) -> float:
+    """The error with a frame camera of square pixels: the surface's own, most of it."""
+    return run_on(CUBES["square"], finished, small, tmp_path_factory.mktemp("plain"))[1].errors.median
+
+
+@pytest.mark.parametrize("name", CUBES)
+def test_a_cube_is_registered_by_a_camera_of_its_own_kind(
+    finished: Finished, small: OnDisk, tmp_path: Path, plain_mm: float, name: str
+) -> None:
+    cube = CUBES[name]
+    report, judged = run_on(cube, finished, small, tmp_path)
+    assert codes(report) & OURS == cube.said
+    assert report.cube_camera.model == cube.model
+    assert report.cube_camera.pixel_aspect == pytest.approx(cube.aspect, abs=0.004)
+    assert 0.02 < judged.errors.median < plain_mm + 0.04
+    assert 0.5 < judged.within(1) < 0.9
+    assert judged.within(2) > 0.88
+    assert report.methods["camera"].leave_one_marker_out_mm is not None
+    assert 0.001 < report.methods["camera"].leave_one_marker_out_mm.median < 0.05
+
+
+def test_two_markers_and_the_specimen_tell_a_scan(
+    finished: Finished, small: OnDisk, tmp_path: Path, plain_mm: float
+) -> None:
+    report, judged = run_on(CUBES["scan of rows"], finished, small, tmp_path, (1, 3))
+    assert report.marker_ids_in_cube == [0, 2]
+    assert codes(report) & OURS <= {NOT_FRAME, "cube_camera_loose"}
+    assert 0.02 < judged.errors.median < plain_mm + 0.06
+    assert judged.within(2) > 0.88
+
+
+def test_a_specimen_that_moved_in_a_scan_is_noticed(finished: Finished, small: OnDisk, tmp_path: Path) -> None:
+    cube = Cube({"cube_scan": "rows", "moved_mm": (1.2, -0.9, 0.0)}, "scan_rows")
+    report, judged = run_on(cube, finished, small, tmp_path)
+    assert codes(report) & OURS >= {NOT_FRAME, "specimen_moved"}
+    assert 1.0 < judged.errors.median < 2.0
+    assert judged.within(2) > 0.88
+
+
+def test_a_scan_that_wavers_is_no_motion_and_its_deviations_hold(
+    finished: Finished, small: OnDisk, tmp_path: Path
+) -> None:
+    cube = Cube({"cube_scan": "rows", "scan_wobble_mm": 0.3}, "scan_rows")
+    report, judged = run_on(cube, finished, small, tmp_path)
+    assert "cube_camera_unfit" in codes(report)
+    assert "specimen_moved" not in codes(report)
+    assert 0.1 < judged.errors.median < 0.5
+    assert judged.within(1) > 0.4
+    assert judged.within(2) > 0.88
+
+
+def test_corners_of_a_cube_are_those_of_its_camera(finished: Finished, small: OnDisk, tmp_path: Path) -> None:
+    report, _ = run_on(CUBES["lines of 0.7"], finished, small, tmp_path)
+    assert report.cube_corners is not None
+    residuals = np.array(report.cube_corners.residuals_px)
+    assert 0.0 < np.sqrt((residuals**2).mean()) < 0.1
+    assert 0.0 < report.cube_camera.reprojection_rms_px < 0.15

@@ -1,0 +1,62 @@
+"""The report in words: a verdict that fits the figures, and an advice for everything that a run can complain of."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from specimap_core.report.model import Refused, Remark, SigmaFigures
+from specimap_core.report.wording import REFUSALS, REMARKS, checks, placed, verdict
+from tests.support.document_scene import full_report
+from tests.support.places import DOCS
+
+
+def table_of(heading: str) -> set[str]:
+    """Codes in the first column of a table of docs/errors.md."""
+    text = (DOCS / "errors.md").read_text(encoding="utf-8").split(f"## {heading}\n")[1].split("\n## ")[0]
+    cells = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
+    return {code for cell in cells for code in re.findall(r"`([a-z0-9_]+)`", cell)}
+
+
+def test_every_documented_code_has_its_advice() -> None:
+    assert table_of("Photos that are not used") <= set(REFUSALS)
+    assert len(table_of("Warnings")) > 15
+    assert table_of("Warnings") <= set(REMARKS)
+
+
+def test_verdicts() -> None:
+    report = full_report(10)
+    said = verdict(report)
+    assert (said.level, said.actions) == ("good", ())
+    assert "All 3 photos were used." in said.sentences
+    warned = report.model_copy(update={"warnings": [Remark(code="few_photos", message="Few.")]})
+    assert verdict(warned).level == "note"
+    assert "with the warnings below" in verdict(warned).title
+
+    lost = [Refused(name=f"{k}.jpg", code="photo_blurred", reason="Blurred.") for k in range(3)]
+    bad = report.model_copy(
+        update={
+            "photos": report.photos.model_copy(update={"given": 6, "refused": lost}),
+            "marker_ids_in_cube": [0, 1],
+            "leave_one_marker_out_mm": None,
+            "coverage": report.coverage.model_copy(update={"between_markers": 0.97}),
+        }
+    )
+    said = verdict(bad)
+    assert said.level == "attention"
+    assert "4 of 6 checks failed" in said.title
+    assert "3 of 6 photos were not used (3 blurred)." in said.sentences
+    assert "0.jpg, 1.jpg, 2.jpg" in said.actions[0]
+    assert "marker 2, 3 in view" in said.actions[1]
+    board = report.model_copy(update={"marker_ids": list(range(30)), "marker_ids_in_cube": list(range(5))})
+    assert all(check.good for check in checks(board))
+
+
+@pytest.mark.parametrize(
+    ("median", "said"),
+    [(0.123, "about 0.1 mm"), (0.087, "about 0.09 mm"), (2.4, "about 2 mm"), (float("nan"), "not known")],
+)
+def test_how_places_are_put_in_words(median: float, said: str) -> None:
+    report = full_report(10).model_copy(update={"sigma_mm": SigmaFigures(median=median, p95=2 * median)})
+    assert said in placed(report)

@@ -1,0 +1,276 @@
+"""Exports whose process dies, hangs, is taken over or stopped: the row says so, and nothing half-written is served."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import sqlalchemy as sa
+
+from specimap_core.errors import CancelledError
+from specimap_infra.tables import CloudRow, Export
+from specimap_workers import exports
+from specimap_workers.exports import run_export
+from tests.support.export_scene import address, make
+from tests.support.result_scene import Result, put_result
+from tests.support.service_scene import Running
+
+
+@pytest.fixture
+def result(service: Running, tmp_path: Path) -> Result:
+    return put_result(service, tmp_path / "result")
+
+
+@pytest.fixture
+def client(service: Running) -> httpx.Client:
+    return service.client()
+
+
+@pytest.fixture
+def slow(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[], int]:
+    """Processes that write half a file and then wait; gives the id of the one that runs, once it has."""
+    script = tmp_path / "slow.py"
+    script.write_text(
+        "import os, pathlib, sys, time\n"
+        "pathlib.Path(sys.argv[-3]).write_bytes(b'half')\n"
+        f"pathlib.Path({str(tmp_path)!r}, 'pid-' + str(os.getpid())).touch()\n"
+        "time.sleep(60)\n"
+    )
+    popen = subprocess.Popen
+
+    def start(command: list[str], **options: Any) -> Any:
+        return popen([command[0], str(script), *command[3:]], **options)
+
+    monkeypatch.setattr(subprocess, "Popen", start)
+    seen: set[str] = set()
+
+    def running() -> int:
+        deadline = time.monotonic() + 20
+        while time.monotonic() < deadline:
+            new = {path.name for path in tmp_path.glob("pid-*")} - seen
+            if new:
+                seen.update(new)
+                return int(new.pop()[4:])
+            time.sleep(0.02)
+        raise AssertionError("no process was started")
+
+    return running
+
+
+def ended(pid: int) -> bool:
+    deadline = time.monotonic() + 10
+    while time.monotonic() < deadline:
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def nothing_left(service: Running) -> bool:
+    stored = service.settings.data_dir / "storage" / "exports"
+    return not list(service.settings.scratch.glob("exp_*")) and not list(stored.rglob("*"))
+
+
+def test_a_process_that_is_killed_is_started_again_and_then_failed(
+    service: Running, client: httpx.Client, result: Result, slow: Callable[[], int]
+) -> None:
+    export_id = client.post(address(result, "ply")).json()["id"]
+    working = threading.Thread(target=make, args=(service, export_id))
+    working.start()
+    for _ in range(service.settings.starts):
+        pid = slow()
+        assert client.get(address(result, "ply")).json()["state"] == "running"
+        assert client.get(address(result, "ply") + "/content").status_code == 409
+        os.kill(pid, signal.SIGKILL)
+    working.join(20)
+    told = client.get(address(result, "ply")).json()
+    assert (told["state"], told["error"]["code"]) == ("failed", "worker_crashed")
+    assert told["error"]["details"] == {"stage": "export", "status": -9}
+    assert client.get(address(result, "ply") + "/content").status_code == 409
+    assert nothing_left(service)
+
+
+def test_a_failed_one_is_tried_again_under_a_new_id(
+    service: Running, client: httpx.Client, result: Result, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mesh = service.settings.data_dir / "storage" / result.prefix / "mesh.ply"
+    whole = mesh.read_bytes()
+    mesh.write_bytes(whole[:-100])
+    first = client.post(address(result, "mesh-stl")).json()["id"]
+    make(service, first)
+    told = client.get(address(result, "mesh-stl")).json()
+    assert (told["state"], told["error"]["code"]) == ("failed", "cloud_damaged")
+    assert str(service.settings.data_dir) not in str(told)
+    mesh.write_bytes(whole)
+    second = client.post(address(result, "mesh-stl"))
+    assert (second.status_code, second.json()["state"], second.json()["error"]) == (202, "queued", None)
+    assert second.json()["id"] != first
+    make(service, first)  # a late repetition of the first changes nothing
+    assert client.get(address(result, "mesh-stl")).json() == second.json()
+    make(service, second.json()["id"])
+    assert client.get(address(result, "mesh-stl")).json()["state"] == "succeeded"
+
+
+def test_another_worker_takes_over_and_the_first_changes_nothing(
+    service: Running, client: httpx.Client, result: Result, slow: Callable[[], int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(exports, "HELD_SECONDS", 0.1)
+    export_id = client.post(address(result, "ply")).json()["id"]
+    frozen = threading.Thread(target=make, args=(service, export_id, "worker-1"))
+    frozen.start()
+    pid = slow()
+    monkeypatch.undo()
+    make(service, export_id, "worker-2")
+    frozen.join(20)
+    assert not frozen.is_alive()
+    assert ended(pid)
+    assert client.get(address(result, "ply")).json()["state"] == "succeeded"
+    assert client.get(address(result, "ply") + "/content").content.startswith(b"ply\n")
+    with service.database.session() as session:
+        row = session.get(Export, export_id)
+        assert row is not None
+        assert row.executor == "worker-2"
+
+
+def test_a_worker_that_comes_too_late_takes_its_file_back(
+    service: Running, client: httpx.Client, result: Result, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    export_id = client.post(address(result, "ply")).json()["id"]
+    finish = exports._finish
+
+    def late(*arguments: Any) -> bool:
+        monkeypatch.undo()
+        make(service, export_id, "worker-2")
+        return finish(*arguments)
+
+    monkeypatch.setattr(exports, "_finish", late)
+    make(service, export_id, "worker-1")
+    stored = service.settings.data_dir / "storage" / "exports"
+    (kept,) = (path for path in stored.rglob("*") if path.is_file())
+    with service.database.session() as session:
+        row = session.get(Export, export_id)
+        assert row is not None
+        assert (row.executor, row.state, row.size) == ("worker-2", "succeeded", kept.stat().st_size)
+        assert row.storage_key is not None
+        assert row.storage_key.endswith(f"/{kept.parent.name}/{kept.name}")
+
+
+def test_stopping_the_worker_leaves_the_row_to_the_next(
+    service: Running, client: httpx.Client, result: Result, slow: Callable[[], int]
+) -> None:
+    export_id = client.post(address(result, "ply")).json()["id"]
+    stop = threading.Event()
+    with ThreadPoolExecutor(1) as pool:
+        working = pool.submit(make, service, export_id, cancelled=stop.is_set)
+        pid = slow()
+        stop.set()
+        with pytest.raises(CancelledError):
+            working.result(timeout=20)
+    assert ended(pid)
+    assert nothing_left(service)
+    assert client.get(address(result, "ply")).json()["state"] == "running"
+
+
+def test_a_cloud_that_is_deleted_meanwhile(
+    service: Running, client: httpx.Client, result: Result, slow: Callable[[], int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(exports, "HELD_SECONDS", 0.1)
+    export_id = client.post(address(result, "ply")).json()["id"]
+    working = threading.Thread(target=make, args=(service, export_id))
+    working.start()
+    pid = slow()
+    with service.database.session() as session:
+        session.execute(sa.delete(CloudRow).where(CloudRow.id == result.cloud_id))
+    working.join(20)
+    assert not working.is_alive()
+    assert ended(pid)
+    assert nothing_left(service)
+
+
+def test_a_stage_limit_holds_for_exports(
+    service: Running, client: httpx.Client, result: Result, slow: Callable[[], int]
+) -> None:
+    export_id = client.post(address(result, "ply")).json()["id"]
+    hasty = service.settings.model_copy(update={"stage_seconds": 0.5})
+    run_export(export_id, service.database, service.storage, hasty, "worker-1")
+    assert ended(slow())
+    assert client.get(address(result, "ply")).json()["error"]["code"] == "stage_timeout"
+
+
+def test_the_process_ends_with_its_worker(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "mesh.ply")  # nobody writes to it: reading it waits
+    program = (
+        "import os, subprocess, sys, time\n"
+        "command = [sys.executable, '-m', 'specimap_workers.export_main', sys.argv[1], 'mesh-stl', sys.argv[2]]\n"
+        "print(subprocess.Popen([*command, str(os.getpid()), '0']).pid, flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path), str(tmp_path / "m.stl")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as worker:
+        assert worker.stdout is not None
+        pid = int(worker.stdout.readline())
+        deadline = time.monotonic() + 20
+        # Opening the pipe without waiting succeeds only once the other side reads.
+        while time.monotonic() < deadline:
+            try:
+                writing = os.open(tmp_path / "mesh.ply", os.O_WRONLY | os.O_NONBLOCK)
+                break
+            except OSError:
+                time.sleep(0.02)
+        worker.kill()
+    assert ended(pid)
+    os.close(writing)
+
+
+def test_the_process_does_nothing_for_a_worker_that_has_gone(result: Result, tmp_path: Path) -> None:
+    target = tmp_path / "c.ply"
+    command = [sys.executable, "-m", "specimap_workers.export_main", str(result.local), "ply", str(target), "1", "0"]
+    assert subprocess.run(command, timeout=60).returncode == 1
+    assert not target.exists()
+
+
+def test_the_process_holds_nothing_of_the_worker(
+    service: Running, client: httpx.Client, result: Result, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Its log, above all: a file that the worker writes could be emptied, a terminal read."""
+    told = tmp_path / "told"
+    script = tmp_path / "taken.py"
+    script.write_text(
+        "import os, pathlib, sys\n"
+        "files = [os.fstat(number) for number in range(3)]\n"
+        f"pathlib.Path({str(told)!r}).write_text(' '.join(f'{{f.st_dev}}:{{f.st_ino}}' for f in files))\n"
+        "pathlib.Path(sys.argv[3]).write_bytes(b'file')\n"
+        "print('x' * 10_000_000)\n"
+        "print('y' * 10_000_000, file=sys.stderr)\n"
+    )
+    popen = subprocess.Popen
+
+    def start(command: list[str], **options: Any) -> Any:
+        return popen([command[0], str(script), *command[3:]], **options)
+
+    monkeypatch.setattr(subprocess, "Popen", start)
+    service_settings = service.settings.model_copy(update={"sandbox": "off"})
+    export_id = client.post(address(result, "ply")).json()["id"]
+    run_export(export_id, service.database, service.storage, service_settings, "worker-1")
+    assert client.get(address(result, "ply")).json()["state"] == "succeeded"
+    own = {f"{stat.st_dev}:{stat.st_ino}" for stat in map(os.fstat, range(3))} - {_of(os.devnull)}
+    given = told.read_text().split()
+    assert given[0] == _of(os.devnull)
+    assert not own & set(given)
+
+
+def _of(path: str) -> str:
+    stat = os.stat(path)
+    return f"{stat.st_dev}:{stat.st_ino}"

@@ -1,0 +1,356 @@
+"""Uploaded files that lead elsewhere, sent with a key for uploads alone: nothing but the file itself is read."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import struct
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import httpx
+import numpy as np
+import pytest
+import tifffile
+
+from specimap_core.sandbox import protection
+from specimap_infra.settings import load_settings
+from specimap_service.acquisitions.judge import Judge
+from specimap_service.acquisitions.verdicts import LONGEST_TEXT, MOST_ITEMS, checked_verdict
+from tests.support.service_scene import Running, serving
+from tests.support.upload_scene import new_acquisition, photos, send, sent
+from tests.support.worker_scene import until
+
+SHAPE = (6, 5, 4)
+CUBE = np.random.default_rng(0).integers(1, 4000, SHAPE).astype(np.uint16)
+SECRET_NM = [412.25, 433.5, 871.125, 998.75]
+"""What the secret file holds, as a reader of wavelengths would understand it."""
+SECRET = np.array(SECRET_NM, "<f8").tobytes()
+
+# Readers without a guard of their own, as a library is before anybody thinks of it.
+NAIVE = """
+import glob, json, sys
+from pathlib import Path
+import h5py, numpy as np, tifffile
+from specimap_core.screening import __main__ as child
+from specimap_core.screening.verdict import Verdict
+
+def whole(task):
+    return Verdict(facts={"part": "whole", "suffix": ".tif" if open(task["path"], "rb").read(2) == b"II" else ".h5"})
+
+def naive(task):
+    if task["path"].endswith(".tif"):
+        values = tifffile.imread(task["path"]).astype(float).ravel()[:4]
+    else:
+        with h5py.File(task["path"]) as file:
+            values = file["wavelength"][()].astype(float)
+    return Verdict(facts={"wavelength_nm": [float(values.min()), float(values.max())]})
+
+child.TASKS["part"], child.TASKS["cube"] = whole, naive
+child.main()
+"""
+
+
+def external(place: str, folder: Path) -> bytes:
+    with h5py.File(folder / "a.h5", "w") as f:
+        f["cube"] = CUBE
+        f.create_dataset("wavelength", (4,), "<f8", external=[(place, 0, len(SECRET))])
+        f["wavelength"].attrs["units"] = "nm"
+    return (folder / "a.h5").read_bytes()
+
+
+def linked(place: str, folder: Path) -> bytes:
+    with h5py.File(folder / "b.h5", "w") as f:
+        f["cube"] = CUBE
+        f["wavelength"] = h5py.ExternalLink(place, "/secret")
+    return (folder / "b.h5").read_bytes()
+
+
+def virtual(place: str, folder: Path) -> bytes:
+    layout = h5py.VirtualLayout((4,), "<f8")
+    layout[:] = h5py.VirtualSource(place, "/secret", (4,), "<f8")
+    with h5py.File(folder / "c.h5", "w") as f:
+        f["cube"] = CUBE
+        f.create_virtual_dataset("wavelength", layout)
+    return (folder / "c.h5").read_bytes()
+
+
+def ome(place: str, folder: Path) -> bytes:
+    """An OME-TIFF of one page whose description says that the pixels are another file's."""
+    text = (
+        '<?xml version="1.0" encoding="UTF-8"?><OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06">'
+        '<Image ID="Image:0"><Pixels ID="Pixels:0" DimensionOrder="XYCZT" Type="double" SizeX="4" SizeY="1" SizeC="1" '
+        'SizeZ="1" SizeT="2"><Channel ID="Channel:0" SamplesPerPixel="1"/>'
+        f'<TiffData IFD="0" FirstT="0" PlaneCount="1"><UUID FileName="{place}">urn:uuid:0</UUID></TiffData>'
+        '<TiffData IFD="0" FirstT="1" PlaneCount="1"><UUID FileName="own.tif">urn:uuid:1</UUID></TiffData>'
+        "</Pixels></Image></OME>"
+    )
+    tifffile.imwrite(folder / "own.ome.tif", np.zeros((1, 4)), description=text, metadata=None)
+    return (folder / "own.ome.tif").read_bytes()
+
+
+HOSTILE: dict[str, Callable[[str, Path], bytes]] = {
+    "external": external,
+    "linked": linked,
+    "virtual": virtual,
+    "ome": ome,
+}
+
+
+def secrets_in(folder: Path) -> dict[str, Path]:
+    """The same secret as plain bytes, in an HDF5 file and in a TIFF, for its owner's eyes alone."""
+    folder.mkdir()
+    places = {"external": folder / "secret", "linked": folder / "secret.h5", "ome": folder / "secret.tif"}
+    places["external"].write_bytes(SECRET)
+    with h5py.File(places["linked"], "w") as f:
+        f["secret"] = np.array(SECRET_NM)
+    tifffile.imwrite(places["ome"], np.array(SECRET_NM)[None])
+    for place in places.values():
+        place.chmod(0o600)
+    return {**places, "virtual": places["linked"]}
+
+
+def uploaded(service: Running, data: bytes, name: str) -> dict[str, Any]:
+    client = service.client(("upload", "read"))
+    return sent(client, new_acquisition(client), "cube", name, data)
+
+
+def told_secret(file: dict[str, Any]) -> bool:
+    text = json.dumps(file)
+    return any(f"{value:g}" in text for value in SECRET_NM)
+
+
+@pytest.mark.parametrize("relative", [False, True])
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_a_file_that_leads_elsewhere_tells_nothing(kind: str, relative: bool, tmp_path: Path) -> None:
+    secret = secrets_in(tmp_path / "elsewhere")[kind]
+    # A judged file lies four folders below the test's own.
+    place = f"../../../../elsewhere/{secret.name}" if relative else str(secret)
+    data = HOSTILE[kind](place, tmp_path)
+    name = "x.tif" if kind == "ome" else "x.h5"
+    with serving(tmp_path / "service") as service:
+        assert not told_secret(uploaded(service, data, name))
+
+
+@pytest.mark.skipif(not protection().whole, reason="this kernel does not confine")
+@pytest.mark.parametrize("sandbox", ["require", "off"])
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_confinement_holds_alone_where_a_reader_would_follow(kind: str, sandbox: str, tmp_path: Path) -> None:
+    secret = secrets_in(tmp_path / "elsewhere")[kind]
+    data = HOSTILE[kind](str(secret), tmp_path)
+    with serving(tmp_path / "service", sandbox=sandbox) as service:
+        judge: Judge = service.app.state.context.judge
+        judge._command = (sys.executable, "-c", NAIVE, *judge._command[3:])
+        file = uploaded(service, data, "x.tif" if kind == "ome" else "x.h5")
+    # Without it the reader follows, which shows that the file is what it should be.
+    assert told_secret(file) == (sandbox == "off" and (kind != "ome" or _follows(data, tmp_path)))
+    if sandbox == "require" and kind in ("external", "linked"):  # of the others a library makes up values
+        assert (file["state"], file["judgement"]["code"]) == ("refused", "judging_crashed")
+
+
+def _follows(data: bytes, folder: Path) -> bool:
+    """Whether this release of tifffile follows names that lead out of the file's folder."""
+    (folder / "follow.ome.tif").write_bytes(data)
+    return bool(np.isin(SECRET_NM, tifffile.imread(folder / "follow.ome.tif")).all())
+
+
+def npz(members: dict[str, bytes]) -> bytes:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    return out.getvalue()
+
+
+def test_other_formats_that_name_paths_write_and_tell_nothing(tmp_path: Path) -> None:
+    secret = secrets_in(tmp_path / "elsewhere")["external"]
+    value = io.BytesIO()
+    np.save(value, CUBE)
+    link = zipfile.ZipInfo("cube.npy")
+    link.external_attr = 0o120777 << 16
+    pickled = io.BytesIO()
+    np.save(pickled, np.array([Opener(str(tmp_path / "made"))], object), allow_pickle=True)
+    header = (
+        f"ENVI\nsamples = 5\nlines = 6\nbands = 4\ndata type = 12\ninterleave = bsq\nbyte order = 0\n"
+        f"header offset = 0\ndata file = {secret}\nwavelength = {{{secret}}}\n"
+    )
+    files = {
+        "slip.npz": npz({"../../../../made.npy": value.getvalue()}),
+        "absolute.npz": npz({f"{tmp_path}/made": b"x"}),
+        "pickle.npy": pickled.getvalue(),
+        "named.hdr": header.encode(),
+    }
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        archive.writestr(link, str(secret))
+    files["link.npz"] = out.getvalue()
+    with serving(tmp_path / "service") as service:
+        for name, data in files.items():
+            file = uploaded(service, data, name)
+            assert not told_secret(file), name
+            assert SECRET.hex() not in json.dumps(file)
+    assert not list(tmp_path.glob("made*"))
+
+
+class Opener:
+    """Unpickled, it makes a file."""
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+
+    def __reduce__(self) -> tuple[Callable[..., object], tuple[str, str]]:
+        return open, (self._path, "w")
+
+
+def test_photos_that_are_not_what_they_seem_tell_nothing(tmp_path: Path) -> None:
+    secret = secrets_in(tmp_path / "elsewhere")["external"]
+    beyond = struct.pack("<2sHIHHHII", b"II", 42, 8, 1, 273, 4, 1, 2**31) + bytes(4)
+    files = {
+        "offset.tif": beyond,
+        "own.ome.tif": ome(str(secret), tmp_path),
+        "a.svg": f'<svg><image href="file://{secret}"/></svg>'.encode(),
+        "a.eps": f"%!PS-Adobe-3.0 EPSF-3.0\n({secret}) (r) file\n".encode(),
+        "a.fpx": bytes.fromhex("d0cf11e0a1b11ae1") * 100,
+    }
+    with serving(tmp_path / "service") as service:
+        client = service.client(("upload", "read"))
+        acquisition = new_acquisition(client)
+        for name, data in files.items():
+            assert not told_secret(sent(client, acquisition, "photo", name, data)), name
+        assert sent(client, acquisition, "photo", "good.jpg", photos()[0].read_bytes())["state"] == "accepted"
+
+
+# ---- what is believed of a child's answer --------------------------------------------------------------
+
+PHOTO = {
+    "verdict": "accepted",
+    "code": None,
+    "reason": "",
+    "advice": "",
+    "suffix": ".jpg",
+    "width": 512,
+    "height": 512,
+    "sharpness": 0.01,
+    "marker_ids": [0, 1],
+    "dictionary_seen": None,
+}
+WHOLE = {"verdict": "accepted", "code": None, "reason": "", "advice": "", "suffix": ".h5", "part": "whole"}
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        None,
+        [],
+        "accepted",
+        {"died": True},
+        {**PHOTO, "verdict": "fine"},
+        {**PHOTO, "suffix": "/../../x"},
+        {**PHOTO, "suffix": ".jpg/../x"},
+        {**PHOTO, "code": "a b"},
+        {**PHOTO, "width": "wide"},
+        {**PHOTO, "marker_ids": list(range(MOST_ITEMS + 1))},
+        {**PHOTO, "sharpness": float("nan")},
+        {**PHOTO, "width": 10**30},
+        {**PHOTO, "more": [[[[[1]]]]]},
+        {k: v for k, v in PHOTO.items() if k != "suffix"},
+    ],
+)
+def test_an_answer_that_no_reader_gives_is_none(told: object) -> None:
+    with pytest.raises(ValueError):  # noqa: PT011 - the message is for nobody
+        checked_verdict("photo", told)
+
+
+def test_an_answer_is_shortened_and_its_wavelengths_are_plausible() -> None:
+    told = checked_verdict("photo", {**PHOTO, "reason": "a\x1b[31m" + "b" * 5000})
+    assert len(told["reason"]) <= LONGEST_TEXT
+    assert "\x1b" not in told["reason"]
+    for given, kept in (
+        ([400, 1000.5], [400, 1000.5]),
+        ([1000, 400], None),
+        ([-1.0, 5], None),
+        ([0.0, 1e300][:1], None),
+        ([1e-9, 2.0], None),
+        ([400, 1e9], None),
+        ("secret", None),
+        ([400, 500, 600], None),
+        (None, None),
+    ):
+        assert checked_verdict("part", {**WHOLE, "wavelength_nm": given})["wavelength_nm"] == kept
+
+
+POISON = """
+import json, os, signal, sys
+from specimap_core.screening import __main__ as child
+from specimap_core.screening.verdict import Verdict
+
+def poison(task):
+    how = task["path"].rpartition("/")[2]
+    if how == "crash":
+        os.abort()
+    if how == "memory":
+        bytearray(1 << 40)
+    if how in ("twice", "huge"):
+        (writing,) = [int(name) for name in range(3, 64) if is_open(name)]
+        os.write(writing, (b'{"verdict": "accepted"}\\n' * 2) if how == "twice" else b"x" * 100)
+        for _ in range(4000 if how == "huge" else 0):
+            os.write(writing, b"x" * 100)
+    return Verdict(facts={"pid": os.getpid(), "parent": os.getppid()})
+
+def is_open(descriptor):
+    try:
+        os.fstat(descriptor)
+    except OSError:
+        return False
+    return True
+
+child.TASKS["cube"] = poison
+child.main()
+"""
+
+
+def test_a_file_costs_its_own_copy_and_no_other_files_answer(tmp_path: Path) -> None:
+    judge = Judge(load_settings(data_dir=tmp_path / "data"), (sys.executable, "-c", POISON))
+    folder = tmp_path / "task"
+    folder.mkdir()
+    try:
+        first = judge.cube(folder / "good")
+        for how in ("crash", "memory", "twice", "huge", "crash"):
+            assert judge.cube(folder / how)["code"] == "judging_crashed", how
+            again = judge.cube(folder / "good")
+            assert again["verdict"] == "accepted"
+            assert again["pid"] not in (first["pid"], again["parent"])
+        # The same two children answered all of it.
+        assert len({again["parent"], first["parent"]}) <= 2
+        assert not list((tmp_path / "data" / "scratch" / "judging").iterdir())
+    finally:
+        judge.close()
+
+
+def test_a_copy_that_ends_while_it_waits_is_no_fault_of_the_next_file(tmp_path: Path) -> None:
+    judge = Judge(load_settings(data_dir=tmp_path / "data"), (sys.executable, "-c", POISON))
+    folder = tmp_path / "task"
+    folder.mkdir()
+    try:
+        child = judge.cube(folder / "good")["parent"]
+        children = Path(f"/proc/{child}/task/{child}/children")
+        (waiting,) = until(lambda: children.read_text().split(), 20, "the next copy")
+        os.kill(int(waiting), signal.SIGKILL)
+        for _ in range(4):  # each of the two children is asked
+            assert judge.cube(folder / "good")["verdict"] == "accepted"
+    finally:
+        judge.close()
+
+
+def test_a_key_for_uploads_reads_no_database(service: Running) -> None:
+    client = service.client(("upload",))
+    acquisition = new_acquisition(client)
+    answer: httpx.Response = send(client, acquisition, "cube", "../../specimap.db", b"x")
+    assert answer.status_code == 201
+    assert client.get(f"/v1/acquisitions/{acquisition}/files").status_code == 403
