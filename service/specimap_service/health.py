@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 from specimap_core import __version__
 from specimap_infra.database import database_seconds
 from specimap_infra.tables import Lease
-from specimap_service.auth.keys import Admin
+from specimap_service.auth.dependencies import Admin
 from specimap_service.context import Context
 
 router = APIRouter(tags=["health"])

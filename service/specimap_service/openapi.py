@@ -11,6 +11,7 @@ import yaml
 
 from specimap_infra.settings import ServiceSettings
 from specimap_service.app import create_app
+from specimap_service.context import CONTEXT
 
 
 def document() -> dict[str, Any]:
@@ -20,7 +21,7 @@ def document() -> dict[str, Any]:
         try:
             return app.openapi()
         finally:
-            app.state.context.close()
+            CONTEXT.of(app).close()
 
 
 def as_yaml(contract: dict[str, Any]) -> str:

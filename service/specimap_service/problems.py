@@ -12,18 +12,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from pydantic.json_schema import models_json_schema
 from starlette.exceptions import HTTPException
 
-from specimap_core.errors import NotFoundError, SpecimapError
+from specimap_core.errors import SpecimapError
 from specimap_infra.logs import logger
 from specimap_service.context import correlation_id
-from specimap_service.errors import (
-    MethodNotAllowedError,
-    PayloadTooLargeError,
-    RateLimitedError,
-    RequestInvalidError,
-    UnauthorizedError,
-    UploadConflictError,
-)
-from specimap_service.http_status import status_of
+from specimap_service.errors import RateLimitedError, RequestInvalidError, UnauthorizedError
+from specimap_service.http_status import error_class, status_of
 
 MEDIA_TYPE = "application/problem+json"
 
@@ -104,7 +97,7 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(HTTPException)
     async def _http(request: Request, error: HTTPException) -> JSONResponse:
-        leaf = _LEAVES.get(error.status_code, SpecimapError if error.status_code >= 500 else RequestInvalidError)
+        leaf = error_class(error.status_code)
         return problem_response(
             leaf(str(error.detail) + ".", advice="/docs shows what there is."),
             error.status_code,
@@ -136,11 +129,3 @@ def describe(app: FastAPI, read_apart: Sequence[type[BaseModel]] = ()) -> None:
 
 
 OF_HTTP = ("content-length", "content-type")
-
-
-_LEAVES: dict[int, type[SpecimapError]] = {
-    404: NotFoundError,
-    405: MethodNotAllowedError,
-    409: UploadConflictError,
-    413: PayloadTooLargeError,
-}

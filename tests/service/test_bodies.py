@@ -12,7 +12,7 @@ from typing import Any
 import httpx
 import pytest
 
-from specimap_service.json_limit import FILES, LARGEST_JSON, LARGEST_SELECTION, SELECTIONS, most_bytes
+from specimap_service.body_limits import FILES, LARGEST_JSON, LARGEST_SELECTION, SELECTIONS, most_bytes
 from specimap_service.uploads.multipart import LONGEST_HEADER, MOST_BESIDE, MOST_HEADERS
 from tests.support.places import SAMPLES
 from tests.support.service_scene import Running, serving

@@ -18,7 +18,7 @@ from specimap_service.acquisitions.capacity import (
 from specimap_service.acquisitions.intake import forget_part
 from specimap_service.acquisitions.routes import check_idle
 from specimap_service.acquisitions.schemas import AcquisitionId, File, FileId
-from specimap_service.auth.keys import Reader, Uploader
+from specimap_service.auth.dependencies import Reader, Uploader
 from specimap_service.byte_ranges import ranged_response
 from specimap_service.context import Context, audit
 

@@ -19,6 +19,7 @@ from specimap_infra.errors import DatabaseUnavailableError, JobConflictError
 from specimap_infra.tables import Acquisition, StoredFile, Upload
 from specimap_service.acquisitions.capacity import check_count, check_quota, locked_acquisition, no_acquisition
 from specimap_service.acquisitions.inspection import Arrival, Findings, Known, judged
+from specimap_service.acquisitions.judge import Judge
 from specimap_service.context import AppContext, audit
 
 ATTEMPTS = 5
@@ -31,7 +32,7 @@ def shown_name(name: str) -> str:
     return re.sub(r"[\x00-\x1f\x7f\ud800-\udfff]", "", name)[:LONGEST_NAME]
 
 
-def take_in(context: AppContext, arrival: Arrival) -> StoredFile:
+def take_in(context: AppContext, judge: Judge, arrival: Arrival) -> StoredFile:
     """Judge and store a file; a refused one is stored too, to be shown.
 
     Raises:
@@ -51,7 +52,7 @@ def take_in(context: AppContext, arrival: Arrival) -> StoredFile:
                     with disk_errors(folder):
                         os.link(arrival.path, folder / "file")
                 try:
-                    findings = judged(context, arrival, known, folder)
+                    findings = judged(judge, context.storage, arrival, known, folder)
                 except NotFoundError:  # the other part was deleted meanwhile
                     continue
             if not moved:

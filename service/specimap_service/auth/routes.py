@@ -6,13 +6,14 @@ import datetime
 from typing import Annotated, Any, Literal
 
 import sqlalchemy as sa
-from fastapi import APIRouter, Path, Query, Request
+from fastapi import APIRouter, Path, Query
 from pydantic import BaseModel, ConfigDict, Field
 
 from specimap_core.errors import NotFoundError
 from specimap_infra.database import utc_now
 from specimap_infra.tables import ApiKey, AuditEntry
-from specimap_service.auth.keys import Admin, Keyring, new_key
+from specimap_service.auth.dependencies import Admin, KeyringDep
+from specimap_service.auth.keys import new_key
 from specimap_service.context import Context, audit
 from specimap_service.paging import Limit, Moment, Page, page_of
 
@@ -94,7 +95,7 @@ def list_keys(context: Context, principal: Admin) -> list[Key]:
 
 
 @router.delete("/keys/{key_id}", status_code=204)
-def revoke_key(context: Context, principal: Admin, request: Request, key_id: KeyId) -> None:
+def revoke_key(context: Context, principal: Admin, keyring: KeyringDep, key_id: KeyId) -> None:
     """Revoke a key; it is refused within two seconds everywhere."""
     with context.database.session() as session:
         row = session.get(ApiKey, key_id)
@@ -102,7 +103,6 @@ def revoke_key(context: Context, principal: Admin, request: Request, key_id: Key
             raise NotFoundError(f"There is no key {key_id}.", advice="GET /v1/keys lists all.")
         row.revoked_at = row.revoked_at or utc_now()
         audit(session, principal.key_id, "key.revoke", key_id)
-    keyring: Keyring = request.app.state.keyring
     keyring.forget()
 
 

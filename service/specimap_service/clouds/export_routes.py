@@ -17,8 +17,9 @@ from specimap_infra.ids import new_id
 from specimap_infra.labels import current_labels, fingerprint, lock_cloud
 from specimap_infra.queue import EXPORTS, MAKE_EXPORT, enqueue
 from specimap_infra.tables import PRIORITIES
-from specimap_service.auth.keys import Reader
+from specimap_service.auth.dependencies import Reader
 from specimap_service.byte_ranges import REVALIDATED, ranged_response
+from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.clouds.open_clouds import CloudRecord
 from specimap_service.context import AppContext, Context, audit, correlation_id
 
@@ -45,14 +46,14 @@ class Export(BaseModel):
     responses={200: {"model": Export, "description": "It is there."}},
 )
 def create_export(
-    context: Context, principal: Reader, response: Response, cloud_id: CloudId, format: FileFormat
+    context: Context, principal: Reader, clouds: CloudsDep, response: Response, cloud_id: CloudId, format: FileFormat
 ) -> Export:
     """Have a file made, once for each format; asked again, tells how far it is.
 
     One that failed is tried again under a new id. `zarr` holds the label layers; where these have changed since, it is
     made anew.
     """
-    cloud = context.clouds.record(cloud_id)
+    cloud = clouds.record(cloud_id)
     response.headers["Location"] = f"/v1/clouds/{cloud_id}/exports/{format.value}"
     if format is FileFormat.MESH_PLY:
         response.status_code = 200
@@ -94,9 +95,9 @@ def create_export(
 
 
 @router.get("")
-def list_exports(context: Context, principal: Reader, cloud_id: CloudId) -> list[Export]:
+def list_exports(context: Context, principal: Reader, clouds: CloudsDep, cloud_id: CloudId) -> list[Export]:
     """The files that are there or under way; `mesh-ply` always is."""
-    cloud = context.clouds.record(cloud_id)
+    cloud = clouds.record(cloud_id)
     query = sa.select(tables.Export).where(tables.Export.cloud_id == cloud_id).order_by(tables.Export.id.desc())
     with context.database.session() as session:
         rows = list(session.scalars(query))
@@ -104,9 +105,9 @@ def list_exports(context: Context, principal: Reader, cloud_id: CloudId) -> list
 
 
 @router.get("/{format}")
-def get_export(context: Context, principal: Reader, cloud_id: CloudId, format: FileFormat) -> Export:
+def get_export(context: Context, principal: Reader, clouds: CloudsDep, cloud_id: CloudId, format: FileFormat) -> Export:
     """How far a file is."""
-    cloud = context.clouds.record(cloud_id)
+    cloud = clouds.record(cloud_id)
     return _mesh_ply(context, cloud) if format is FileFormat.MESH_PLY else _shown(_found(context, cloud_id, format))
 
 
@@ -128,10 +129,10 @@ FILE: dict[int | str, dict[str, Any]] = {
 @router.head("/{format}/content", response_class=Response, responses=FILE, operation_id="head_export_content")
 @router.get("/{format}/content", response_class=Response, responses=FILE)
 def get_content(
-    context: Context, principal: Reader, request: Request, cloud_id: CloudId, format: FileFormat
+    context: Context, principal: Reader, clouds: CloudsDep, request: Request, cloud_id: CloudId, format: FileFormat
 ) -> Response:
     """The file itself; single byte ranges, so that a broken download goes on."""
-    cloud = context.clouds.record(cloud_id)
+    cloud = clouds.record(cloud_id)
     if format is FileFormat.MESH_PLY:
         key: str | None = _mesh_key(cloud)
     else:

@@ -23,7 +23,8 @@ from specimap_core.cloud.shards import PointArray
 from specimap_infra.labels import current_labels
 from specimap_infra.tables import LabelVersion
 from specimap_service.array_responses import ARROW, JSON, NPY, arrow_answer, chosen_type, documented, json_answer
-from specimap_service.auth.keys import Labeller, Reader
+from specimap_service.auth.dependencies import Labeller, Reader
+from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.clouds.label_body import (
     EXAMPLE_TEXT,
     HEADER,
@@ -35,7 +36,7 @@ from specimap_service.clouds.label_body import (
     parse_values,
 )
 from specimap_service.clouds.label_store import Conditions, delete_label, find_label, no_label, put_label
-from specimap_service.clouds.open_clouds import LabelRecord
+from specimap_service.clouds.open_clouds import LabelRecord, OpenClouds
 from specimap_service.context import AppContext, Context
 from specimap_service.errors import MediaTypeError, PayloadTooLargeError
 
@@ -89,6 +90,7 @@ BINARY = {"schema": {"type": "string", "format": "binary"}}
 async def put(
     context: Context,
     principal: Labeller,
+    clouds: CloudsDep,
     request: Request,
     response: Response,
     cloud_id: CloudId,
@@ -111,14 +113,14 @@ async def put(
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media not in (ARROW, NPY):
         raise MediaTypeError(f"{HEADER} comes with an array.", advice=f"Send {ARROW} or {NPY}.", offered=[ARROW, NPY])
-    points = (await run_in_threadpool(context.clouds.record, cloud_id)).points
+    points = (await run_in_threadpool(clouds.record, cloud_id)).points
     scratch = context.settings.scratch / f"label-{uuid4().hex}.body.tmp"
     try:
         await _receive(request, scratch, most_bytes(metadata, points))
 
         def store() -> tuple[LabelVersion, bool]:
             values = parse_values(scratch, media == ARROW, metadata, points)
-            return put_label(context, principal, cloud_id, name, metadata, values, conditions)
+            return put_label(context, clouds, principal, cloud_id, name, metadata, values, conditions)
 
         row, new = await run_in_threadpool(store)
     finally:
@@ -156,27 +158,35 @@ def _append(target: FilePath, data: bytes) -> None:
 
 
 @router.get("/clouds/{cloud_id}/labels")
-def list_labels(context: Context, principal: Reader, cloud_id: CloudId) -> list[Label]:
+def list_labels(context: Context, principal: Reader, clouds: CloudsDep, cloud_id: CloudId) -> list[Label]:
     """The current version of each layer, by name."""
-    context.clouds.record(cloud_id)
+    clouds.record(cloud_id)
     with context.database.session() as session:
         return [_shown(row) for row in current_labels(session, cloud_id)]
 
 
 @router.get("/clouds/{cloud_id}/labels/{name}")
 def get_label(
-    context: Context, principal: Reader, response: Response, cloud_id: CloudId, name: LabelName, version: Version = None
+    context: Context,
+    principal: Reader,
+    clouds: CloudsDep,
+    response: Response,
+    cloud_id: CloudId,
+    name: LabelName,
+    version: Version = None,
 ) -> Label:
     """A layer's metadata; its ETag is the version, for If-Match."""
-    row = _find(context, cloud_id, name, version)
+    row = _find(context, clouds, cloud_id, name, version)
     response.headers["ETag"] = f'"{row.version}"'
     return _shown(row)
 
 
 @router.get("/clouds/{cloud_id}/labels/{name}/versions")
-def list_versions(context: Context, principal: Reader, cloud_id: CloudId, name: LabelName) -> list[Label]:
+def list_versions(
+    context: Context, principal: Reader, clouds: CloudsDep, cloud_id: CloudId, name: LabelName
+) -> list[Label]:
     """All versions of a layer, newest first."""
-    context.clouds.record(cloud_id)
+    clouds.record(cloud_id)
     query = sa.select(LabelVersion).where(LabelVersion.cloud_id == cloud_id, LabelVersion.name == name)
     with context.database.session() as session:
         rows = list(session.scalars(query.order_by(LabelVersion.version.desc())))
@@ -187,15 +197,21 @@ def list_versions(context: Context, principal: Reader, cloud_id: CloudId, name: 
 
 @router.get("/clouds/{cloud_id}/labels/{name}/values", response_model=None, responses=documented(LabelValues))
 def get_values(
-    context: Context, principal: Reader, request: Request, cloud_id: CloudId, name: LabelName, version: Version = None
+    context: Context,
+    principal: Reader,
+    clouds: CloudsDep,
+    request: Request,
+    cloud_id: CloudId,
+    name: LabelName,
+    version: Version = None,
 ) -> Response:
     """A layer's values in the order of the cloud's points, in the forms that PUT takes, or as JSON."""
     media = chosen_type(request)
-    row = _find(context, cloud_id, name, version)
+    row = _find(context, clouds, cloud_id, name, version)
     headers = {"X-Specimap-Label-Version": str(row.version)}
     record = LabelRecord(row.name, row.version, row.kind, row.storage_prefix)
-    with context.clouds.reading(cloud_id):
-        array = context.clouds.label_array(record)
+    with clouds.reading(cloud_id):
+        array = clouds.label_array(record)
         if media == NPY:
             return _npy(array, headers)
         if media == ARROW:
@@ -234,13 +250,13 @@ def _npy(array: PointArray, headers: dict[str, str]) -> Response:
 
 
 @router.delete("/clouds/{cloud_id}/labels/{name}", status_code=204)
-def delete(context: Context, principal: Labeller, cloud_id: CloudId, name: LabelName) -> None:
+def delete(context: Context, principal: Labeller, clouds: CloudsDep, cloud_id: CloudId, name: LabelName) -> None:
     """Delete a layer with all its versions."""
-    delete_label(context, principal, cloud_id, name)
+    delete_label(context, clouds, principal, cloud_id, name)
 
 
-def _find(context: AppContext, cloud_id: str, name: str, version: int | None) -> LabelVersion:
-    context.clouds.record(cloud_id)
+def _find(context: AppContext, clouds: OpenClouds, cloud_id: str, name: str, version: int | None) -> LabelVersion:
+    clouds.record(cloud_id)
     with context.database.session() as session:
         return find_label(session, cloud_id, name, version)
 

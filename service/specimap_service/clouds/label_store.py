@@ -24,6 +24,7 @@ from specimap_infra.storage import Storage
 from specimap_infra.tables import LabelVersion
 from specimap_service.auth.keys import Principal
 from specimap_service.clouds.label_body import LabelMetadata
+from specimap_service.clouds.open_clouds import OpenClouds
 from specimap_service.context import AppContext, audit
 from specimap_service.errors import PreconditionFailedError, RequestInvalidError
 
@@ -72,6 +73,7 @@ class Conditions:
 
 def put_label(
     context: AppContext,
+    clouds: OpenClouds,
     principal: Principal,
     cloud_id: str,
     name: str,
@@ -128,11 +130,11 @@ def put_label(
             raise
     finally:
         remove(work)
-    context.clouds.forget(cloud_id)
+    clouds.forget(cloud_id)
     return row, True
 
 
-def delete_label(context: AppContext, principal: Principal, cloud_id: str, name: str) -> None:
+def delete_label(context: AppContext, clouds: OpenClouds, principal: Principal, cloud_id: str, name: str) -> None:
     """Remove a layer with all its versions.
 
     Raises:
@@ -146,7 +148,7 @@ def delete_label(context: AppContext, principal: Principal, cloud_id: str, name:
             raise no_label(cloud_id, name)
         session.execute(sa.delete(LabelVersion).where(layer))
         audit(session, principal.key_id, "label.delete", cloud_id, layer=name, versions=len(prefixes))
-    context.clouds.forget(cloud_id)
+    clouds.forget(cloud_id)
     for prefix in prefixes:
         context.storage.delete(prefix)
 

@@ -12,12 +12,14 @@ from specimap_core import __version__
 from specimap_core.cloud import Cloud
 from specimap_core.errors import NotFoundError
 from specimap_core.json_text import json_text
-from specimap_service.auth.keys import Reader
+from specimap_service.auth.dependencies import Reader
 from specimap_service.clouds import pictures
+from specimap_service.clouds.dependencies import CloudsDep, PicturesDep
 from specimap_service.clouds.label_store import find_label
-from specimap_service.clouds.open_clouds import LabelRecord
+from specimap_service.clouds.open_clouds import LabelRecord, OpenClouds
+from specimap_service.clouds.picture_cache import PictureCache
 from specimap_service.clouds.pictures import LARGEST_SIDE, Grid, Painted, Picture
-from specimap_service.context import AppContext, Context
+from specimap_service.context import Context
 from specimap_service.errors import RequestInvalidError
 
 router = APIRouter(prefix="/v1/clouds/{cloud_id}/previews", tags=["previews"])
@@ -63,29 +65,43 @@ PNG: dict[int | str, dict[str, Any]] = {
 
 @router.get("/rgb.png", response_class=Response, responses=PNG)
 def rgb(
-    context: Context, principal: Reader, request: Request, cloud_id: CloudId, size: Size = 1024, grid: Where = "cube"
+    principal: Reader,
+    clouds: CloudsDep,
+    cache: PicturesDep,
+    request: Request,
+    cloud_id: CloudId,
+    size: Size = 1024,
+    grid: Where = "cube",
 ) -> Response:
     """The photos' colours."""
-    return _picture(context, request, cloud_id, grid, size, pictures.paint_rgb, ["rgb"])
+    return _picture(clouds, cache, request, cloud_id, grid, size, pictures.paint_rgb, ["rgb"])
 
 
 @router.get("/pca.png", response_class=Response, responses=PNG)
 def pca(
-    context: Context, principal: Reader, request: Request, cloud_id: CloudId, size: Size = 1024, grid: Where = "cube"
+    context: Context,
+    principal: Reader,
+    clouds: CloudsDep,
+    cache: PicturesDep,
+    request: Request,
+    cloud_id: CloudId,
+    size: Size = 1024,
+    grid: Where = "cube",
 ) -> Response:
     """The first three principal components of the spectra as colours, as the run drew them."""
 
     def paint(cloud: Cloud) -> Painted:
-        prefix = context.clouds.record(cloud_id).prefix
+        prefix = clouds.record(cloud_id).prefix
         return pictures.paint_pca(cloud, context.storage.read(f"{prefix}/preview.png"))
 
-    return _picture(context, request, cloud_id, grid, size, paint, ["pca"])
+    return _picture(clouds, cache, request, cloud_id, grid, size, paint, ["pca"])
 
 
 @router.get("/band.png", response_class=Response, responses=PNG)
 def band(
-    context: Context,
     principal: Reader,
+    clouds: CloudsDep,
+    cache: PicturesDep,
     request: Request,
     cloud_id: CloudId,
     b: Annotated[str | None, _band("The band")] = None,
@@ -103,13 +119,14 @@ def band(
     def paint(cloud: Cloud) -> Painted:
         return pictures.paint_band(cloud, pictures.band_index(cloud, chosen), limits)
 
-    return _picture(context, request, cloud_id, grid, size, paint, ["band", chosen, limits])
+    return _picture(clouds, cache, request, cloud_id, grid, size, paint, ["band", chosen, limits])
 
 
 @router.get("/composite.png", response_class=Response, responses=PNG)
 def composite(
-    context: Context,
     principal: Reader,
+    clouds: CloudsDep,
+    cache: PicturesDep,
     request: Request,
     cloud_id: CloudId,
     r: Annotated[str, _band("Band shown in red")] = TRUE_COLOUR[0],
@@ -124,13 +141,14 @@ def composite(
         red, green, blue = (pictures.band_index(cloud, given) for given in (r, g, b))
         return pictures.paint_composite(cloud, (red, green, blue))
 
-    return _picture(context, request, cloud_id, grid, size, paint, ["composite", r, g, b])
+    return _picture(clouds, cache, request, cloud_id, grid, size, paint, ["composite", r, g, b])
 
 
 @router.get("/index.png", response_class=Response, responses=PNG)
 def index(
-    context: Context,
     principal: Reader,
+    clouds: CloudsDep,
+    cache: PicturesDep,
     request: Request,
     cloud_id: CloudId,
     a: Annotated[str, _band("First band")],
@@ -147,13 +165,15 @@ def index(
         first, second = (pictures.band_index(cloud, given) for given in (a, b))
         return pictures.paint_index(cloud, first, second, limits)
 
-    return _picture(context, request, cloud_id, grid, size, paint, ["index", a, b, limits])
+    return _picture(clouds, cache, request, cloud_id, grid, size, paint, ["index", a, b, limits])
 
 
 @router.get("/label.png", response_class=Response, responses=PNG)
 def label(
     context: Context,
     principal: Reader,
+    clouds: CloudsDep,
+    cache: PicturesDep,
     request: Request,
     cloud_id: CloudId,
     name: Annotated[str, Query(pattern=r"^[a-z0-9_-]{1,64}$", description="The layer.")],
@@ -169,7 +189,7 @@ def label(
 ) -> Response:
     """A label layer over the dimmed photos: classes in their colours, probabilities as a colour scale from 0 to 1."""
     limits = _limits(low, high)
-    context.clouds.record(cloud_id)
+    clouds.record(cloud_id)
     with context.database.session() as session:
         row = find_label(session, cloud_id, name, version)
     record = LabelRecord(row.name, row.version, row.kind, row.storage_prefix)
@@ -182,7 +202,7 @@ def label(
         )
 
     def paint(cloud: Cloud) -> Painted:
-        array = context.clouds.label_array(record)
+        array = clouds.label_array(record)
         values = array.read(0, array.shape[0])
         if row.kind == "class":
             return pictures.paint_classes(cloud, values, row.classes)
@@ -190,7 +210,7 @@ def label(
         return pictures.paint_probability(cloud, values.reshape(len(values), -1)[:, column], limits)
 
     parameters = ["label", row.storage_prefix, class_value, limits]
-    return _picture(context, request, cloud_id, grid, size, paint, parameters)
+    return _picture(clouds, cache, request, cloud_id, grid, size, paint, parameters)
 
 
 def _limits(low: float | None, high: float | None) -> tuple[float, float] | None:
@@ -202,23 +222,30 @@ def _limits(low: float | None, high: float | None) -> tuple[float, float] | None
 
 
 def _picture(
-    context: AppContext, request: Request, cloud_id: str, grid: Grid, size: int, paint: Paint, parameters: list[Any]
+    clouds: OpenClouds,
+    cache: PictureCache,
+    request: Request,
+    cloud_id: str,
+    grid: Grid,
+    size: int,
+    paint: Paint,
+    parameters: list[Any],
 ) -> Response:
-    """The answer; ``parameters`` are all that the picture depends on beside cloud, grid and size."""
-    context.clouds.record(cloud_id)
+    """The answer; ``parameters`` are all else that the picture depends on."""
+    clouds.record(cloud_id)
     # A cloud never changes: what it is drawn from, and by which program, says which picture it is.
-    told = json_text([__version__, cloud_id, grid, size, *parameters])
-    tag = hashlib.sha256(told.encode()).hexdigest()[:32]
+    identity = json_text([__version__, cloud_id, grid, size, *parameters])
+    tag = hashlib.sha256(identity.encode()).hexdigest()[:32]
     headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache", "Vary": "Authorization"}
     known = [part.strip().removeprefix("W/") for part in request.headers.get("if-none-match", "").split(",")]
     if f'"{tag}"' in known or "*" in known:
         return Response(status_code=304, headers=headers)
 
     def draw() -> Picture:
-        with context.clouds.reading(cloud_id) as (_, cloud):
+        with clouds.reading(cloud_id) as (_, cloud):
             return pictures.draw(cloud, paint(cloud), grid, size)
 
-    picture = context.pictures.get(tag, draw)
+    picture = cache.get(tag, draw)
     if picture.range is not None:
         headers["X-Specimap-Range"] = ",".join(f"{value:.6g}" for value in picture.range)
     if picture.extent_mm is not None:

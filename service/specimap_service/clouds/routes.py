@@ -11,8 +11,9 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from specimap_infra.tables import Acquisition, CloudRow, Job
-from specimap_service.auth.keys import Reader
+from specimap_service.auth.dependencies import Reader
 from specimap_service.byte_ranges import ranged_response
+from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import Context
 from specimap_service.paging import After, Limit, Page, page_of
 
@@ -71,9 +72,9 @@ def list_clouds(
 
 
 @router.get("/clouds/{cloud_id}")
-def show_cloud(context: Context, principal: Reader, cloud_id: CloudId) -> CloudAnswer:
+def show_cloud(principal: Reader, clouds: CloudsDep, cloud_id: CloudId) -> CloudAnswer:
     """One cloud."""
-    with context.clouds.reading(cloud_id) as (record, cloud):
+    with clouds.reading(cloud_id) as (record, cloud):
         boxes, here = cloud.chunk_aabb, f"/v1/clouds/{cloud_id}"
         return CloudAnswer(
             **CloudSummary.model_validate(record).model_dump(),
@@ -99,7 +100,9 @@ def show_cloud(context: Context, principal: Reader, cloud_id: CloudId) -> CloudA
 @router.get(
     "/clouds/{cloud_id}/corners", response_class=Response, responses={200: {"content": {"application/json": {}}}}
 )
-def get_corners(context: Context, principal: Reader, request: Request, cloud_id: CloudId) -> Response:
+def get_corners(
+    context: Context, principal: Reader, clouds: CloudsDep, request: Request, cloud_id: CloudId
+) -> Response:
     """The markers' corners: `{"<id>": [[x, y, z] * 4]}`, mm, in the marker frame."""
-    record = context.clouds.record(cloud_id)
+    record = clouds.record(cloud_id)
     return ranged_response(request, context.storage, f"{record.prefix}/corners.json", "application/json")

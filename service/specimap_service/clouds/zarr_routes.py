@@ -14,8 +14,9 @@ from specimap_core.cloud.source import ByteSource
 from specimap_core.errors import NotFoundError
 from specimap_core.json_text import json_text
 from specimap_infra.storage import Storage
-from specimap_service.auth.keys import Reader
+from specimap_service.auth.dependencies import Reader
 from specimap_service.byte_ranges import CACHED, REVALIDATED, ranged_bytes, ranged_response
+from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.clouds.open_clouds import CloudRecord, StoredFolder
 from specimap_service.clouds.routes import CloudId
 from specimap_service.context import Context
@@ -39,6 +40,7 @@ _ANSWERS: dict[int | str, dict[str, Any]] = {
 def zarr_file(
     context: Context,
     principal: Reader,
+    clouds: CloudsDep,
     request: Request,
     cloud_id: CloudId,
     key: Annotated[str, Path(description="As in the group: `zarr.json`, `spectra/c/0/0`, `labels/tissue/zarr.json`.")],
@@ -49,12 +51,12 @@ def zarr_file(
     consolidated metadata, the labels among them, and `labels/zarr.json` with those of the labels. Labels appear as
     `labels/<name>`, in their current version.
     """
-    record = context.clouds.record(cloud_id)
+    record = clouds.record(cloud_id)
     # Every key is made of characters that need no escape: what comes escaped is none, whatever it decodes to.
     if b"%" in request.scope.get("raw_path", b""):
         raise _no_such(key)
     if key in (DOCUMENT, f"labels/{DOCUMENT}"):
-        with context.clouds.reading(cloud_id) as (record, _):
+        with clouds.reading(cloud_id) as (record, _):
             return ranged_bytes(request, _group_document(context.storage, record, labels=key != DOCUMENT), JSON)
     array, _, rest = key.partition("/")
     if array == "labels":

@@ -19,9 +19,10 @@ from specimap_infra.logs import logger
 from specimap_infra.queue import JOBS, RUN_JOB, enqueue
 from specimap_infra.tables import FINAL_STATES, PRIORITIES, Acquisition, Job
 from specimap_infra.webhooks import check_target
-from specimap_service.acquisitions.deletion import Leftovers
+from specimap_service.clouds.open_clouds import OpenClouds
 from specimap_service.context import AppContext, audit, correlation_id
 from specimap_service.errors import IdempotencyConflictError, UploadIncompleteError
+from specimap_service.jobs.deletion import JobFiles
 from specimap_service.jobs.schemas import JobRequest, RerunRequest, Webhook
 
 
@@ -144,11 +145,11 @@ def _no_acquisition(acquisition_id: str) -> NotFoundError:
 
 
 def stop_workflow(context: AppContext, job_id: str) -> None:
-    """Tell the engine that a job was cancelled. Where it cannot be told, the worker learns from the job's row."""
-    _tell_engine(context.queue.cancel_workflow, job_id)
+    """Cancel a job's workflow at the engine. Where that fails, the worker learns of it from the job's row."""
+    _call_engine(context.queue.cancel_workflow, job_id)
 
 
-def delete_job(context: AppContext, key_id: str, job_id: str) -> None:
+def delete_job(context: AppContext, clouds: OpenClouds, key_id: str, job_id: str) -> None:
     """Remove a job that has ended, its result, and all their files.
 
     Raises:
@@ -160,14 +161,14 @@ def delete_job(context: AppContext, key_id: str, job_id: str) -> None:
         job = locked(session, job_id) or found_job(session, job_id)
         if job.state not in FINAL_STATES:
             raise JobConflictError(f"Job {job_id} is {job.state}.", advice="Cancel it first.", state=job.state)
-        acquisition, leftovers = job.acquisition_id, Leftovers.of(session, [job_id])
+        acquisition, files = job.acquisition_id, JobFiles.of(session, [job_id])
         session.execute(sa.delete(Job).where(Job.id == job_id))
         audit(session, key_id, "job.delete", job_id, acquisition=acquisition)
-    _tell_engine(context.queue.delete_workflow, job_id)
-    leftovers.remove(context)
+    _call_engine(context.queue.delete_workflow, job_id)
+    files.remove(context.storage, clouds)
 
 
-def _tell_engine(call: Callable[[str], None], job_id: str) -> None:
+def _call_engine(call: Callable[[str], None], job_id: str) -> None:
     try:
         call(job_id)
     except (SQLAlchemyError, dbos_error.DBOSException) as error:

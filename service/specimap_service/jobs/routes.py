@@ -17,9 +17,12 @@ from specimap_infra.errors import JobConflictError
 from specimap_infra.job_schemas import JobState, JobView, job_views
 from specimap_infra.jobs import locked, request_cancel
 from specimap_infra.tables import FINAL_STATES, CloudRow, Job, JobEvent
-from specimap_service.auth.keys import Admin, Reader, Uploader
+from specimap_service.auth.dependencies import Admin, Reader, Uploader
+from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import AppContext, Context, audit
 from specimap_service.jobs.commands import delete_job, found_job, new_job, repeated_job, stop_workflow
+from specimap_service.jobs.dependencies import EventsDep
+from specimap_service.jobs.events import JobEvents
 from specimap_service.jobs.schemas import (
     AfterJob,
     AfterSeq,
@@ -119,9 +122,9 @@ def cancel_job(context: Context, principal: Uploader, job_id: JobId) -> JobView:
 
 
 @router.delete("/jobs/{job_id}", status_code=204)
-def remove_job(context: Context, principal: Admin, job_id: JobId) -> None:
+def remove_job(context: Context, principal: Admin, clouds: CloudsDep, job_id: JobId) -> None:
     """Delete a job that has ended, with its result."""
-    delete_job(context, principal.key_id, job_id)
+    delete_job(context, clouds, principal.key_id, job_id)
 
 
 @router.get("/jobs/{job_id}/report")
@@ -172,6 +175,7 @@ def get_log(
 async def follow_events(
     context: Context,
     principal: Reader,
+    events: EventsDep,
     job_id: JobId,
     last_event_id: LastEventId = None,
     after: AfterSeq = None,
@@ -185,7 +189,7 @@ async def follow_events(
     if await run_in_threadpool(_nothing_after, context, job_id, start):
         return Response(status_code=204)
     return EventSourceResponse(
-        _encoded(context, job_id, start),
+        _encoded(events, job_id, start),
         # Proxies that gather answers would keep the events back.
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
@@ -199,8 +203,8 @@ def _nothing_after(context: AppContext, job_id: str, seq: int) -> bool:
         return job.state in FINAL_STATES and session.scalar(later) is None
 
 
-async def _encoded(context: AppContext, job_id: str, after: int) -> AsyncIterator[bytes]:
-    async for event in context.events.follow(job_id, after):
+async def _encoded(events: JobEvents, job_id: str, after: int) -> AsyncIterator[bytes]:
+    async for event in events.follow(job_id, after):
         if event is None:
             yield KEEPALIVE_COMMENT
         else:

@@ -20,11 +20,13 @@ from specimap_service.acquisitions.capacity import (
 from specimap_service.acquisitions.inspection import Arrival
 from specimap_service.acquisitions.intake import shown_name, take_in
 from specimap_service.acquisitions.schemas import AcquisitionId, File
-from specimap_service.auth.keys import Principal, Uploader
+from specimap_service.auth.dependencies import Uploader
+from specimap_service.auth.keys import Principal
 from specimap_service.context import AppContext, Context
 from specimap_service.errors import QuotaExceededError, RequestInvalidError
+from specimap_service.uploads.dependencies import UploadsDep
+from specimap_service.uploads.lifecycle import Uploads
 from specimap_service.uploads.multipart import FormFiles, Part
-from specimap_service.uploads.routes import Files
 
 router = APIRouter(prefix="/v1", tags=["files"])
 DISK_EVERY = 64 * 1024 * 1024
@@ -52,7 +54,7 @@ FORM: dict[str, Any] = {
 }
 
 
-class _Room:
+class _FormLimits:
     """The limits of one request; ``left`` bytes are left of the key's quota."""
 
     def __init__(self, context: AppContext, acquisition_id: str, left: int) -> None:
@@ -61,7 +63,7 @@ class _Room:
         self._asked_at = 0
 
     def begin(self, role: str, files: int) -> None:
-        """One more file."""
+        """Check that one more file may come."""
         if role == "photo":
             self._photos += 1
             with self._context.database.session() as session:
@@ -70,7 +72,7 @@ class _Room:
             raise RequestInvalidError("More than 20 files in one form.", advice="Send fewer at a time.")
 
     def grow(self, role: str, size: int, total: int) -> None:
-        """More bytes."""
+        """Check that a file may have ``size`` bytes, and all files together ``total``."""
         if size > largest(self._context.settings, role):
             check_size(self._context.settings, role, size)
         if total > self._left:
@@ -90,21 +92,21 @@ def _over_quota(left: int) -> QuotaExceededError:
 
 @router.post("/acquisitions/{acquisition_id}/files", status_code=201, openapi_extra=FORM)
 async def add_files(
-    context: Context, principal: Uploader, uploads: Files, request: Request, acquisition_id: AcquisitionId
+    context: Context, principal: Uploader, uploads: UploadsDep, request: Request, acquisition_id: AcquisitionId
 ) -> list[File]:
     """Send some files in one form: `role` before its files. For large files and shaky networks use /v1/uploads."""
-    room = await asyncio.to_thread(_room, context, principal, request, acquisition_id)
-    form = FormFiles(uploads.folder, room)
+    limits = await asyncio.to_thread(_limits, context, principal, request, acquisition_id)
+    form = FormFiles(uploads.files.folder, limits)
     try:
         parts = await form.read(request)
         context.metrics.uploaded.inc(sum(part.size for part in parts))
-        return await asyncio.to_thread(_store, context, principal, acquisition_id, parts)
+        return await asyncio.to_thread(_store, uploads, principal, acquisition_id, parts)
     finally:
         await asyncio.to_thread(form.close)
 
 
-def _room(context: AppContext, principal: Principal, request: Request, acquisition_id: str) -> _Room:
-    """All that can be refused before the body is read."""
+def _limits(context: AppContext, principal: Principal, request: Request, acquisition_id: str) -> _FormLimits:
+    """Refuse before the body is read what can be refused then; return the limits for the rest."""
     length = request.headers.get("content-length", "0")
     announced = int(length) if length.isdecimal() else 0
     settings = context.settings
@@ -119,16 +121,17 @@ def _room(context: AppContext, principal: Principal, request: Request, acquisiti
         check_size(settings, "cube", announced)
     if announced > left + (1 << 20):
         raise _over_quota(left)
-    return _Room(context, acquisition_id, left)
+    return _FormLimits(context, acquisition_id, left)
 
 
-def _store(context: AppContext, principal: Principal, acquisition_id: str, parts: list[Part]) -> list[File]:
+def _store(uploads: Uploads, principal: Principal, acquisition_id: str, parts: list[Part]) -> list[File]:
     stored: list[File] = []
     for part in parts:
         if not part.size:
             raise RequestInvalidError("A file is empty.", advice="Send the file itself.", stored=[f.id for f in stored])
         row = take_in(
-            context,
+            uploads.context,
+            uploads.judge,
             Arrival(
                 new_id("file"),
                 acquisition_id,
