@@ -57,7 +57,7 @@ ROUTES = (
 
 
 def create_app(settings: ServiceSettings) -> FastAPI:
-    """An app on the database and storage that the settings name; the database has been migrated.
+    """Create an app on the database and storage that the settings name; the database has been migrated.
 
     Raises:
         SettingsError, OutputNotWritableError: the storage or its folder cannot be made.
@@ -72,7 +72,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
                 await stack.enter_async_context(feature.running(app))
             yield
 
-    # Its pages bring their scripts along: nothing is fetched from elsewhere.
+    # The offline variant serves the scripts of its pages itself: nothing is fetched from elsewhere.
     app = FastAPIOffline(
         title="Specimap",
         version=__version__,
@@ -86,8 +86,8 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     CONTEXT.set(app, context)
     for feature in FEATURES:
         feature.open(app, context)
-    problems.install(app)
-    problems.describe(app, read_apart=[SpectraRequest])
+    problems.add_handlers(app)
+    problems.describe(app, extra_models=[SpectraRequest])
     for routes in ROUTES:
         app.include_router(routes.router)
     # The last one added sees a request first: the limits come after CORS and the corrections of uploads, and before

@@ -1,4 +1,4 @@
-"""What all features share: settings, database, storage, queue client, metrics; made when the app is created."""
+"""Objects that all features share: settings, database, storage, queue client, metrics; made when the app is created."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from specimap_service.metrics import Metrics
 
 @dataclass(frozen=True)
 class AppContext:
-    """One for each app."""
+    """Objects that all features share, one set for each app."""
 
     settings: ServiceSettings
     database: Database
@@ -51,12 +51,15 @@ Context = Annotated[AppContext, Depends(CONTEXT.of_request)]
 
 
 def correlation_id() -> str:
-    """The id that stands in every log line, error and row that belong to the current request."""
+    """Return the id in every log line, error and row of the current request."""
     return str(structlog.contextvars.get_contextvars().get("correlation_id", ""))
 
 
 def audit(session: Session, key_id: str, action: str, target: str, **details: object) -> None:
-    """Note who did what, within the transaction that does it. ``details`` hold ids and numbers, no names."""
+    """Add an entry to the audit trail within the transaction that it records.
+
+    ``details`` hold ids and numbers, no names.
+    """
     session.add(
         AuditEntry(key_id=key_id, action=action, target=target, details=details, correlation_id=correlation_id())
     )

@@ -17,10 +17,10 @@ def _nothing(app: FastAPI) -> AbstractAsyncContextManager[None]:
 
 @dataclass(frozen=True)
 class Feature:
-    """What ``create_app`` needs of a feature, its routes apart.
+    """Setup and shutdown of a feature, apart from its routes.
 
     ``open`` puts the feature's objects into the app's state when the app is created. ``running`` is entered when the
-    app starts to serve and left when it stops: it runs what goes on in the background and closes what ``open`` made.
+    app starts to serve and left when it stops: it runs background tasks, and closes the objects that ``open`` made.
     """
 
     open: Callable[[FastAPI, AppContext], None]

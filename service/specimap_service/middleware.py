@@ -1,4 +1,4 @@
-"""Plain ASGI middleware: a correlation id, an access log, metrics, and a last answer to unforeseen errors."""
+"""Plain ASGI middleware: correlation id, access log, metrics, and the answer to unforeseen errors."""
 
 from __future__ import annotations
 

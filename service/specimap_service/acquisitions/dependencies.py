@@ -1,4 +1,4 @@
-"""The judge of arriving files, and what deleting an acquisition has to clear away elsewhere."""
+"""The judge of arriving files, and the unfinished uploads that go with a deleted acquisition."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from specimap_service.feature import Feature
 
 
 class UnfinishedUploads(Protocol):
-    """The bytes of uploads under way. The feature of uploads provides it, which itself builds on acquisitions."""
+    """The bytes of unfinished uploads. The feature of uploads provides them, which itself builds on acquisitions."""
 
     def remove(self, upload_id: str) -> None:
         """Remove the bytes of an upload, if there are any."""

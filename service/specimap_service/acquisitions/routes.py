@@ -1,4 +1,4 @@
-"""Acquisitions: what was captured of one specimen, under a pseudonym."""
+"""Acquisitions: the photos and the cube of one specimen, under a pseudonym."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class AcquisitionRequest(BaseModel):
 
 
 class AcquisitionView(BaseModel):
-    """An acquisition, what has arrived of it, and what is missing."""
+    """An acquisition, the files that have arrived, and those that are missing."""
 
     model_config = ConfigDict(title="Acquisition", from_attributes=True)
 
@@ -58,7 +58,7 @@ class AcquisitionView(BaseModel):
     edge_mm: float
     notes: str
     created_at: datetime.datetime
-    created_by: str = Field(description="The key that made it.")
+    created_by: str = Field(description="Id of the key that created it.")
     files: FileCounts
     ready: bool = Field(description="Whether a job can run.")
     missing: list[str] = Field(description="What is still needed, a sentence each.")
@@ -68,7 +68,7 @@ class AcquisitionView(BaseModel):
 def create_acquisition(
     context: Context, principal: Uploader, judge: JudgeDep, wanted: AcquisitionRequest
 ) -> AcquisitionView:
-    """Make an acquisition; then upload its photos and its cube."""
+    """Create an acquisition; then upload its photos and its cube."""
     row = Acquisition(id=new_id("acq"), created_by=principal.key_id, created_at=utc_now(), **wanted.model_dump())
     with context.database.session() as session:
         session.add(row)
@@ -85,12 +85,12 @@ def list_acquisitions(
     principal: Reader,
     specimen_id: Annotated[str | None, Query(max_length=64)] = None,
     accession_number: Annotated[str | None, Query(max_length=64)] = None,
-    created_after: Annotated[Moment | None, Query(description="Only those made at this time or later.")] = None,
-    created_before: Annotated[Moment | None, Query(description="Only those made before this time.")] = None,
+    created_after: Annotated[Moment | None, Query(description="Only those created at this time or later.")] = None,
+    created_before: Annotated[Moment | None, Query(description="Only those created before this time.")] = None,
     after: After = None,
     limit: Limit = 50,
 ) -> Page[AcquisitionView]:
-    """Acquisitions, newest first."""
+    """List acquisitions, newest first."""
     query = sa.select(Acquisition).order_by(Acquisition.id.desc()).limit(limit + 1)
     for column, value in ((Acquisition.specimen_id, specimen_id), (Acquisition.accession_number, accession_number)):
         if value is not None:
@@ -109,7 +109,7 @@ def list_acquisitions(
 
 @router.get("/acquisitions/{acquisition_id}")
 def get_acquisition(context: Context, principal: Reader, acquisition_id: AcquisitionId) -> AcquisitionView:
-    """One acquisition."""
+    """Return one acquisition."""
     with context.database.session() as session:
         row = session.get(Acquisition, acquisition_id)
         if row is None:
@@ -125,7 +125,7 @@ def delete_acquisition(
     clouds: CloudsDep,
     acquisition_id: AcquisitionId,
 ) -> None:
-    """Delete an acquisition and all that hangs on it: files, jobs, results, labels, exports. It cannot be undone."""
+    """Delete an acquisition with its files, jobs, results, labels and exports. This cannot be undone."""
     with context.database.session() as session:
         row = locked_acquisition(session, acquisition_id)
         check_idle(session, acquisition_id)

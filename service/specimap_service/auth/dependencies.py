@@ -1,4 +1,4 @@
-"""The key of a request: checked, counted against its rate, and asked for a scope."""
+"""Authentication of requests: the key, its rate limit, its scopes."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ def _open(app: FastAPI, context: AppContext) -> None:
 FEATURE = Feature(_open)
 KeyringDep = Annotated[Keyring, Depends(KEYRING.of_request)]
 PRINCIPAL = "specimap.principal"
-"""Where a request's scope holds its principal, once that is known."""
+"""Key under which a request's ASGI scope holds its principal, once that is known."""
 
 
 async def authenticated(request: Request) -> Principal:
-    """The principal of a request by its headers alone; one request more of its key's rate.
+    """Return the principal of a request by its headers alone, and count it against the key's rate.
 
     Raises:
         UnauthorizedError: there is no key, or no valid one. RateLimitedError: too many requests, or wrong keys.
@@ -50,7 +50,7 @@ async def authenticated(request: Request) -> Principal:
     try:
         found = keyring.trusted(key)
         if found is None:
-            # A thread costs as much as the rest of a short request: it is taken only to ask the database.
+            # A thread costs as much as the rest of a short request, so it is taken only to ask the database.
             found = await run_in_threadpool(keyring.principal, key)
     except UnauthorizedError:
         address = request.client.host if request.client else "unknown"
@@ -65,12 +65,12 @@ _bearer = HTTPBearer(auto_error=False, scheme_name="key", description="`Authoriz
 
 
 def requires(scope: str) -> Callable[..., Awaitable[Principal]]:
-    """A dependency: the request's principal, if its key has the scope. ``admin`` has all."""
+    """Make a dependency: the request's principal, if its key has the scope. ``admin`` has all."""
 
     async def principal(
         request: Request, _: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
     ) -> Principal:
-        # Known already where the request may have a body: no byte of it is read before.
+        # Already known where the request may have a body, which is not read before.
         found: Principal = request.scope.get(PRINCIPAL) or await authenticated(request)
         if scope not in found.scopes and "admin" not in found.scopes:
             raise ForbiddenError(f"The key lacks the scope {scope!r}.", advice="Use a key that has it.", scope=scope)

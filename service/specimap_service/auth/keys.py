@@ -1,4 +1,4 @@
-"""Who may do what: keys with scopes. A key is ``spk_<id>_<secret>`` in ``Authorization: Bearer``, never in a URL."""
+"""Keys with scopes. A key is ``spk_<id>_<secret>`` in ``Authorization: Bearer``, never in a URL."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def new_key(
     rate_per_minute: int | None = None,
     quota_bytes: int | None = None,
 ) -> tuple[ApiKey, str]:
-    """A row to store, and the key itself, which is nowhere kept."""
+    """Make a row to store, and the key itself, which is kept nowhere."""
     row_id, secret = new_id("key"), secrets.token_hex(32)
     row = ApiKey(
         id=row_id,
@@ -70,10 +70,10 @@ class Keyring:
         self._lock = threading.Lock()
 
     def principal(self, key: str) -> Principal:
-        """Who a key belongs to.
+        """Return the principal of a key.
 
         Raises:
-            UnauthorizedError: it is unknown, expired or revoked; which of these is not told.
+            UnauthorizedError: it is unknown, expired or revoked; the error does not say which.
         """
         found = self.trusted(key)
         if found is not None:
@@ -86,13 +86,13 @@ class Keyring:
         return principal
 
     def trusted(self, key: str) -> Principal | None:
-        """Who a key belongs to, if it was looked up a moment ago; asks no database."""
+        """Return the principal of a key that was looked up a moment ago; asks no database."""
         with self._lock:
             found = self._kept.get(_hash(key))
         return found[1] if found is not None and time.monotonic() - found[0] < KEPT_SECONDS else None
 
     def forget(self) -> None:
-        """Trust nothing that was looked up before."""
+        """Look every key up again."""
         with self._lock:
             self._kept.clear()
 
@@ -101,7 +101,7 @@ class Keyring:
         name, _, secret = rest.partition("_")
         with self._database.session() as session:
             row = session.get(ApiKey, f"key_{name}") if prefix == PREFIX else None
-            # Compared even where there is no such key, so that the time taken says nothing.
+            # Compared even where there is no such key, so that the time taken gives nothing away.
             same = hmac.compare_digest(_hash(secret), row.secret_hash if row else "0" * 64)
             now = utc_now()
             if (

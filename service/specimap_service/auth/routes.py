@@ -1,4 +1,4 @@
-"""Keys: made, listed, revoked by an administrator; and the audit trail."""
+"""Keys, created, listed and revoked by an administrator; and the audit trail."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ KeyId = Annotated[str, Path(pattern=r"^key_[0-9a-z]{26}$")]
 
 
 class KeyRequest(BaseModel):
-    """What a new key may do."""
+    """A key to be created."""
 
     model_config = ConfigDict(
         extra="forbid", json_schema_extra={"example": {"name": "tablet 3", "scopes": ["upload", "read"]}}
@@ -52,13 +52,13 @@ class Key(BaseModel):
 
 
 class NewKey(Key):
-    """A key that was just made."""
+    """A key that was just created."""
 
     key: str = Field(description="The key itself; it is shown this once and kept nowhere.")
 
 
 class Audited(BaseModel):
-    """Who did what to which thing."""
+    """An entry of the audit trail: which key did what to which object."""
 
     model_config = ConfigDict(from_attributes=True)
 
@@ -73,7 +73,7 @@ class Audited(BaseModel):
 
 @router.post("/keys", status_code=201)
 def create_key(context: Context, principal: Admin, wanted: KeyRequest) -> NewKey:
-    """Make a key."""
+    """Create a key."""
     row, key = new_key(
         wanted.name,
         wanted.scopes,
@@ -89,7 +89,7 @@ def create_key(context: Context, principal: Admin, wanted: KeyRequest) -> NewKey
 
 @router.get("/keys")
 def list_keys(context: Context, principal: Admin) -> list[Key]:
-    """All keys, revoked ones too."""
+    """List all keys, revoked ones too."""
     with context.database.session() as session:
         return [Key.model_validate(row) for row in session.scalars(sa.select(ApiKey).order_by(ApiKey.id))]
 
@@ -111,12 +111,12 @@ def list_audit(
     context: Context,
     principal: Admin,
     target: Annotated[
-        str | None, Query(pattern=r"^[a-z]{2,5}_[0-9a-z]{26}$", description="Only what was done to this thing.")
+        str | None, Query(pattern=r"^[a-z]{2,5}_[0-9a-z]{26}$", description="Only entries about this object.")
     ] = None,
     after: Annotated[int | None, Query(ge=1, description="`next` of the page before.")] = None,
     limit: Limit = 100,
 ) -> Page[Audited]:
-    """Who did what, newest first."""
+    """List the audit trail, newest entry first."""
     query = sa.select(AuditEntry).order_by(AuditEntry.id.desc()).limit(limit + 1)
     if target is not None:
         query = query.where(AuditEntry.target == target)

@@ -1,4 +1,4 @@
-"""Pictures of a cloud: colours, bands, indices, labels."""
+"""Pictures of a cloud: colours, bands, normalised differences, labels."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from specimap_service.clouds.dependencies import CloudsDep, PicturesDep
 from specimap_service.clouds.label_store import find_label
 from specimap_service.clouds.open_clouds import LabelRecord, OpenClouds
 from specimap_service.clouds.picture_cache import PictureCache
-from specimap_service.clouds.pictures import LARGEST_SIDE, Grid, Painted, Picture
+from specimap_service.clouds.pictures import LARGEST_SIDE, Grid, Picture, PointColours
 from specimap_service.context import Context
 from specimap_service.errors import RequestInvalidError
 
@@ -36,7 +36,7 @@ High = Annotated[
 ]
 BAND = r"^(\d{1,5}|\d{1,5}(\.\d{1,4})?nm)$"
 TRUE_COLOUR = ("640nm", "550nm", "460nm")
-Paint = Callable[[Cloud], Painted]
+Paint = Callable[[Cloud], PointColours]
 
 
 def _band(description: str) -> Any:
@@ -45,7 +45,7 @@ def _band(description: str) -> Any:
 
 PNG: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "PNG, transparent where no point is.",
+        "description": "PNG, transparent where there is no point.",
         "content": {"image/png": {"schema": {"type": "string", "format": "binary"}}},
         "headers": {
             "ETag": {"schema": {"type": "string"}},
@@ -59,7 +59,7 @@ PNG: dict[int | str, dict[str, Any]] = {
             },
         },
     },
-    304: {"description": "The client has it."},
+    304: {"description": "The client has the current picture."},
 }
 
 
@@ -73,7 +73,7 @@ def rgb(
     size: Size = 1024,
     grid: Where = "cube",
 ) -> Response:
-    """The photos' colours."""
+    """Show the photos' colours."""
     return _picture(clouds, cache, request, cloud_id, grid, size, pictures.paint_rgb, ["rgb"])
 
 
@@ -88,9 +88,9 @@ def pca(
     size: Size = 1024,
     grid: Where = "cube",
 ) -> Response:
-    """The first three principal components of the spectra as colours, as the run drew them."""
+    """Show the first three principal components of the spectra as colours, as the run drew them."""
 
-    def paint(cloud: Cloud) -> Painted:
+    def paint(cloud: Cloud) -> PointColours:
         prefix = clouds.record(cloud_id).prefix
         return pictures.paint_pca(cloud, context.storage.read(f"{prefix}/preview.png"))
 
@@ -111,12 +111,12 @@ def band(
     size: Size = 1024,
     grid: Where = "cube",
 ) -> Response:
-    """One band in grey."""
+    """Show one band in grey."""
     if (b is None) == (nm is None):
         raise RequestInvalidError("Which band is not said, or said twice.", advice="Give either b or nm.")
     chosen, limits = b if b is not None else f"{nm:.4f}nm", _limits(low, high)
 
-    def paint(cloud: Cloud) -> Painted:
+    def paint(cloud: Cloud) -> PointColours:
         return pictures.paint_band(cloud, pictures.band_index(cloud, chosen), limits)
 
     return _picture(clouds, cache, request, cloud_id, grid, size, paint, ["band", chosen, limits])
@@ -135,9 +135,9 @@ def composite(
     size: Size = 1024,
     grid: Where = "cube",
 ) -> Response:
-    """Three bands as red, green and blue, each between its 2nd and 98th percentile."""
+    """Show three bands as red, green and blue, each between its 2nd and 98th percentile."""
 
-    def paint(cloud: Cloud) -> Painted:
+    def paint(cloud: Cloud) -> PointColours:
         red, green, blue = (pictures.band_index(cloud, given) for given in (r, g, b))
         return pictures.paint_composite(cloud, (red, green, blue))
 
@@ -158,10 +158,10 @@ def index(
     size: Size = 1024,
     grid: Where = "cube",
 ) -> Response:
-    """The normalised difference (a - b) / (a + b) as a colour scale; transparent where a + b is not positive."""
+    """Show the normalised difference (a - b) / (a + b) as a colour scale; transparent where a + b is not positive."""
     limits = _limits(low, high)
 
-    def paint(cloud: Cloud) -> Painted:
+    def paint(cloud: Cloud) -> PointColours:
         first, second = (pictures.band_index(cloud, given) for given in (a, b))
         return pictures.paint_index(cloud, first, second, limits)
 
@@ -180,14 +180,14 @@ def label(
     version: Annotated[int | None, Query(ge=1, le=10**9, description="By default the current one.")] = None,
     class_value: Annotated[
         int | None,
-        Query(alias="class", ge=0, le=65535, description="Whose probability; by default the first class's."),
+        Query(alias="class", ge=0, le=65535, description="Class whose probability is shown; by default the first."),
     ] = None,
     low: Low = None,
     high: High = None,
     size: Size = 1024,
     grid: Where = "cube",
 ) -> Response:
-    """A label layer over the dimmed photos: classes in their colours, probabilities as a colour scale from 0 to 1."""
+    """Show a label layer over the dimmed photos: classes in their colours, probabilities on a scale from 0 to 1."""
     limits = _limits(low, high)
     clouds.record(cloud_id)
     with context.database.session() as session:
@@ -201,7 +201,7 @@ def label(
             classes=known,
         )
 
-    def paint(cloud: Cloud) -> Painted:
+    def paint(cloud: Cloud) -> PointColours:
         array = clouds.label_array(record)
         values = array.read(0, array.shape[0])
         if row.kind == "class":
@@ -231,9 +231,9 @@ def _picture(
     paint: Paint,
     parameters: list[Any],
 ) -> Response:
-    """The answer; ``parameters`` are all else that the picture depends on."""
+    """Answer with a picture; ``parameters`` are everything else that it depends on."""
     clouds.record(cloud_id)
-    # A cloud never changes: what it is drawn from, and by which program, says which picture it is.
+    # A cloud never changes: parameters and program version identify the picture.
     identity = json_text([__version__, cloud_id, grid, size, *parameters])
     tag = hashlib.sha256(identity.encode()).hexdigest()[:32]
     headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache", "Vary": "Authorization"}

@@ -1,4 +1,4 @@
-"""Spectra of points, by number, by place or by pixel; and single bands of all points."""
+"""Spectra of points, selected by number, position or pixel; and single bands of all points."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from specimap_service.array_responses import (
     NPY,
     arrow_answer,
     chosen_type,
-    documented,
+    documented_responses,
     json_answer,
     npy_answer,
 )
@@ -56,7 +56,7 @@ Number = Annotated[int, Path(ge=0, lt=2**32)]
 def show_point(
     principal: Reader, clouds: CloudsDep, cloud_id: CloudId, index: Number, bands: BandList = None
 ) -> Response:
-    """One point: place, colour, flags, labels, spectrum."""
+    """Return one point: position, colour, flags, labels, spectrum."""
     with clouds.reading(cloud_id) as (record, cloud):
         if index >= cloud.n_points:
             raise NotFoundError(
@@ -97,7 +97,10 @@ async def _wanted(request: Request, limiter: ParsingDep) -> SpectraRequest:
 
 
 @router.post(
-    "/clouds/{cloud_id}/spectra", response_model=SpectraAnswer, responses=documented(SpectraAnswer), openapi_extra=BODY
+    "/clouds/{cloud_id}/spectra",
+    response_model=SpectraAnswer,
+    responses=documented_responses(SpectraAnswer),
+    openapi_extra=BODY,
 )
 def read_spectra(
     principal: Reader,
@@ -106,11 +109,11 @@ def read_spectra(
     cloud_id: CloudId,
     wanted: Annotated[SpectraRequest, Depends(_wanted)],
 ) -> Response:
-    """Spectra of the points selected, a page at a time.
+    """Return spectra of the selected points, a page at a time.
 
-    Arrow: columns `index`, the fields asked for, `spectrum`; total, quantity, bands and wavelengths in the schema's
+    Arrow: columns `index`, the requested fields, `spectrum`; total, quantity, bands and wavelengths in the schema's
     metadata. NumPy: the spectra alone, float32 (points, bands). `X-Specimap-Total` counts the whole selection,
-    `X-Specimap-Next-Offset` is there where a further page is.
+    `X-Specimap-Next-Offset` is present if there is another page.
     """
     media = chosen_type(request)
     limit = min(wanted.limit or JSON_PAGE, MOST_JSON_POINTS) if media == JSON else wanted.limit or PAGE
@@ -151,9 +154,9 @@ def read_spectra(
         )
 
 
-@router.get("/clouds/{cloud_id}/bands/{band}", response_model=BandAnswer, responses=documented(BandAnswer))
+@router.get("/clouds/{cloud_id}/bands/{band}", response_model=BandAnswer, responses=documented_responses(BandAnswer))
 def read_band(principal: Reader, clouds: CloudsDep, request: Request, cloud_id: CloudId, band: Number) -> Response:
-    """One band of all points, in their order. Arrow: column `value`; NumPy: float32 (points,)."""
+    """Return one band of all points, in their order. Arrow: column `value`; NumPy: float32 (points,)."""
     media = chosen_type(request)
     with clouds.reading(cloud_id) as (record, cloud):
         if band >= cloud.bands:

@@ -1,4 +1,4 @@
-"""The feed of job events that requests listen to."""
+"""The events of jobs that requests follow."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The uploads under way, cleared of expired ones while the app runs."""
+"""Uploads of the app, and the task that removes expired ones while it runs."""
 
 from __future__ import annotations
 

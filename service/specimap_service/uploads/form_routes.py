@@ -1,4 +1,4 @@
-"""Files of an acquisition sent in one form."""
+"""Upload of several files of an acquisition in one form."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from specimap_service.acquisitions.capacity import (
     check_count,
     check_disks,
     check_size,
-    largest,
+    max_file_bytes,
     no_acquisition,
     quota_left,
 )
 from specimap_service.acquisitions.inspection import Arrival
-from specimap_service.acquisitions.intake import shown_name, take_in
+from specimap_service.acquisitions.intake import clean_name, take_in
 from specimap_service.acquisitions.schemas import AcquisitionId, File
 from specimap_service.auth.dependencies import Uploader
 from specimap_service.auth.keys import Principal
@@ -60,7 +60,7 @@ class _FormLimits:
     def __init__(self, context: AppContext, acquisition_id: str, left: int) -> None:
         self._context, self._acquisition_id, self._left = context, acquisition_id, left
         self._photos = 0
-        self._asked_at = 0
+        self._disk_checked_at = 0
 
     def begin(self, role: str, files: int) -> None:
         """Check that one more file may come."""
@@ -73,16 +73,16 @@ class _FormLimits:
 
     def grow(self, role: str, size: int, total: int) -> None:
         """Check that a file may have ``size`` bytes, and all files together ``total``."""
-        if size > largest(self._context.settings, role):
+        if size > max_file_bytes(self._context.settings, role):
             check_size(self._context.settings, role, size)
         if total > self._left:
-            raise _over_quota(self._left)
-        if total - self._asked_at > DISK_EVERY:
-            self._asked_at = total
+            raise _quota_exceeded(self._left)
+        if total - self._disk_checked_at > DISK_EVERY:
+            self._disk_checked_at = total
             check_disks(self._context, 0)
 
 
-def _over_quota(left: int) -> QuotaExceededError:
+def _quota_exceeded(left: int) -> QuotaExceededError:
     return QuotaExceededError(
         f"The key's quota leaves {max(left, 0)} bytes.",
         advice="Delete acquisitions that are no longer needed, or ask the administrator for a higher quota.",
@@ -120,7 +120,7 @@ def _limits(context: AppContext, principal: Principal, request: Request, acquisi
     if announced > most:
         check_size(settings, "cube", announced)
     if announced > left + (1 << 20):
-        raise _over_quota(left)
+        raise _quota_exceeded(left)
     return _FormLimits(context, acquisition_id, left)
 
 
@@ -136,7 +136,7 @@ def _store(uploads: Uploads, principal: Principal, acquisition_id: str, parts: l
                 new_id("file"),
                 acquisition_id,
                 part.role,
-                shown_name(part.name),
+                clean_name(part.name),
                 part.path,
                 part.size,
                 part.sha256,

@@ -24,7 +24,7 @@ from specimap_infra.logs import logger
 from specimap_infra.tables import ROLES, StoredFile, Upload
 from specimap_service.acquisitions.capacity import check_count, check_disks, check_quota, check_size, locked_acquisition
 from specimap_service.acquisitions.inspection import Arrival
-from specimap_service.acquisitions.intake import shown_name, take_in
+from specimap_service.acquisitions.intake import clean_name, take_in
 from specimap_service.acquisitions.judge import Judge
 from specimap_service.acquisitions.schemas import counts
 from specimap_service.auth.keys import Principal
@@ -32,7 +32,7 @@ from specimap_service.context import AppContext, audit
 from specimap_service.errors import ForbiddenError, RequestInvalidError, UploadGoneError
 from specimap_service.uploads.files import UploadFiles, no_upload
 
-STRAY_SECONDS = 3600.0
+ABANDONED_SECONDS = 3600.0
 FINISH_SECONDS = 60.0
 """How long one process waits for another that finishes the same upload, in addition to the time of the judging."""
 SERVICE = "service"
@@ -76,7 +76,7 @@ class Uploads:
             id=new_id("up"),
             acquisition_id=acquisition_id,
             role=role,
-            name=shown_name(metadata.get("filename", "")),
+            name=clean_name(metadata.get("filename", "")),
             size=size,
             state="open",
             created_at=now,
@@ -92,7 +92,7 @@ class Uploads:
                 else:
                     _check_wanted(session, acquisition_id, role)
                 check_quota(session, principal, size)
-                check_disks(self.context, size, self._coming(session))
+                check_disks(self.context, size, self._expected_bytes(session))
                 session.add(upload)
                 audit(
                     session,
@@ -225,7 +225,7 @@ class Uploads:
                 os.close(handle)
             self.expire(row.id)
         known = {row.id for row in rows}
-        for path in self.files.strays(known, STRAY_SECONDS):
+        for path in self.files.abandoned(known, ABANDONED_SECONDS):
             remove(path)
         judging = self.context.settings.scratch / "judging"
         for folder in judging.iterdir() if judging.is_dir() else ():
@@ -247,7 +247,7 @@ class Uploads:
             raise no_upload()
         return upload
 
-    def _coming(self, session: Session) -> int:
+    def _expected_bytes(self, session: Session) -> int:
         """Count the bytes that open uploads have still to send."""
         rows = session.execute(
             sa.select(Upload.id, Upload.size).where(Upload.state == "open", Upload.expires_at > utc_now())
@@ -274,5 +274,5 @@ def _check_wanted(session: Session, acquisition_id: str, role: str) -> None:
 
 def _remove_old(folder: Path) -> None:
     with suppress(FileNotFoundError):
-        if time.time() - folder.stat().st_mtime > STRAY_SECONDS:
+        if time.time() - folder.stat().st_mtime > ABANDONED_SECONDS:
             shutil.rmtree(folder, ignore_errors=True)

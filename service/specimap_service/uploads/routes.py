@@ -1,4 +1,4 @@
-"""The result of a resumable upload, and what this tus server can do."""
+"""Routes that the tus library does not serve: the result of an upload, and what this server supports."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ State = Literal["open", "finished", "failed", "expired", "terminated"]
 
 
 class Failure(BaseModel):
-    """Why an upload came to nothing."""
+    """The reason why an upload failed."""
 
     code: str
     message: str
@@ -27,19 +27,19 @@ class Failure(BaseModel):
 
 
 class UploadResult(BaseModel):
-    """How an upload stands, and the file that it became."""
+    """The state of an upload, and the file that it became."""
 
     id: str
     state: State
     offset: int = Field(description="Bytes that have arrived.")
     size: int = Field(description="Bytes announced.")
     file: File | None = Field(description="Once finished: the stored file with its judgement; null if deleted since.")
-    error: Failure | None = Field(description="Where it failed: why.")
+    error: Failure | None = Field(description="The reason, where it failed.")
 
 
 @router.get("/uploads/{upload_id}/result")
 def get_result(principal: Uploader, uploads: UploadsDep, upload_id: UploadId) -> UploadResult:
-    """How an upload stands. For a finished one the file, with the judgement and an advice where it is to be retaken."""
+    """Return the state of an upload; for a finished one its file, with the judgement and advice on retaking it."""
     upload = uploads.current(upload_id, principal)
     stored = uploads.stored_file(upload)
     return UploadResult(
@@ -54,7 +54,7 @@ def get_result(principal: Uploader, uploads: UploadsDep, upload_id: UploadId) ->
 
 @router.options("/uploads", status_code=204, response_class=Response)
 def get_abilities(context: Context, principal: Uploader) -> Response:
-    """What this tus server can do: the `Tus-…` headers of the answer."""
+    """Return what this tus server supports, in the `Tus-…` headers of the answer."""
     settings = context.settings
     headers = {
         "Tus-Version": tus.VERSION,

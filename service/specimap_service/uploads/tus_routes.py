@@ -28,8 +28,8 @@ OCTETS = "application/offset+octet-stream"
 # ---- before the library sees a request ----------------------------------------------------------------
 
 
-def _admitted(request: Request, principal: Uploader, uploads: UploadsDep) -> None:
-    """Check all that can be checked before the body is read: the library checks most of it afterwards."""
+def _check_request(request: Request, principal: Uploader, uploads: UploadsDep) -> None:
+    """Check before the body is read whatever can be checked then; the library checks most of it afterwards."""
     exchange, headers = tus.exchange(), request.headers
     exchange.principal = principal
     if headers.get("tus-resumable") != tus.VERSION:
@@ -79,7 +79,7 @@ def _check_chunk(request: Request, upload: Upload, files: UploadFiles, exchange:
         exchange.checksum = tus.parsed_checksum(headers["upload-checksum"])
 
 
-async def _verified(uploads: UploadsDep, _: Annotated[None, Depends(_admitted)]) -> None:
+async def _verify_checksum(uploads: UploadsDep, _: Annotated[None, Depends(_check_request)]) -> None:
     exchange = tus.exchange()
     if exchange.checksum is not None and exchange.upload is not None:
         await exchange.verify(exchange.upload.size, uploads.files.folder)
@@ -88,7 +88,9 @@ async def _verified(uploads: UploadsDep, _: Annotated[None, Depends(_admitted)])
 # ---- the library's hooks ------------------------------------------------------------------------------
 
 
-def _creating(context: Context, uploads: UploadsDep) -> Callable[[dict[str, str], dict[str, Any]], Awaitable[None]]:
+def _creation_hook(
+    context: Context, uploads: UploadsDep
+) -> Callable[[dict[str, str], dict[str, Any]], Awaitable[None]]:
     async def create(metadata: dict[str, str], info: dict[str, Any]) -> None:
         exchange = tus.exchange()
         assert exchange.principal is not None
@@ -100,7 +102,7 @@ def _creating(context: Context, uploads: UploadsDep) -> Callable[[dict[str, str]
     return create
 
 
-def _naming() -> Callable[[dict[str, str]], dict[str, str]]:
+def _naming_hook() -> Callable[[dict[str, str]], dict[str, str]]:
     def name(metadata: dict[str, str]) -> dict[str, str]:
         upload = tus.exchange().upload
         return {} if upload is None else {"uid": upload.id}
@@ -108,7 +110,7 @@ def _naming() -> Callable[[dict[str, str]], dict[str, str]]:
     return name
 
 
-def _completing(uploads: UploadsDep) -> Callable[[str, dict[str, str]], Awaitable[None]]:
+def _completion_hook(uploads: UploadsDep) -> Callable[[str, dict[str, str]], Awaitable[None]]:
     async def complete(upload_id: str, metadata: dict[str, str]) -> None:
         exchange = tus.exchange()
         if exchange.upload is not None and exchange.upload.state == "open":
@@ -152,17 +154,17 @@ DOCUMENTED: dict[str, dict[str, Any]] = {
     },
     "HEAD": {
         "summary": "Ask how much has arrived",
-        "description": "`Upload-Offset` says where to go on.",
+        "description": "`Upload-Offset` says where to continue.",
         "headers": ("Upload-Offset", "Upload-Length", "Upload-Metadata"),
     },
     "PATCH": {
         "summary": "Send bytes",
         "description": "From `Upload-Offset` on; with `Upload-Checksum` (sha1, sha256 or md5, and the digest in "
         "base64) all or nothing: 460 where it differs. The answer to the last byte comes when the file has been "
-        "judged, and carries `Specimap-File` and `Specimap-Verdict`; `GET …/result` tells more.",
+        "judged, and carries `Specimap-File` and `Specimap-Verdict`; `GET …/result` says more.",
         "headers": ("Upload-Offset", "Upload-Expires", "Specimap-File", "Specimap-Verdict"),
     },
-    "DELETE": {"summary": "End an upload", "description": "Its bytes are forgotten.", "headers": ()},
+    "DELETE": {"summary": "End an upload", "description": "Its bytes are removed.", "headers": ()},
 }
 
 
@@ -184,11 +186,11 @@ def mount(app: FastAPI) -> None:
     """Add the tus routes to an app whose features are open."""
     context, uploads = CONTEXT.of(app), UPLOADS.of(app)
     store = UploadStore(uploads.files, received=context.metrics.uploaded.inc, delete=uploads.terminate)
-    # Its annotations leave out that hooks may be coroutines and return something.
+    # The library's annotations do not say that hooks may be coroutines and return a value.
     hooks: dict[str, Any] = {
-        "pre_create_dep": _creating,
-        "upload_complete_dep": _completing,
-        "file_dep": _naming,
+        "pre_create_dep": _creation_hook,
+        "upload_complete_dep": _completion_hook,
+        "file_dep": _naming_hook,
     }
     library = create_tus_router(
         prefix=tus.PREFIX,
@@ -198,12 +200,12 @@ def mount(app: FastAPI) -> None:
         max_size=max(context.settings.max_photo_bytes, context.settings.max_cube_bytes),
         **hooks,
     )
-    # Its OPTIONS advertises extensions that are not served here.
+    # The library's OPTIONS advertises extensions that are not served here.
     library.routes[:] = [
         route for route in library.routes if isinstance(route, APIRoute) and route.methods != {"OPTIONS"}
     ]
     for route in library.routes:
         if isinstance(route, APIRoute):
             _document(route)
-    app.include_router(library, dependencies=[Depends(_verified)])
-    app.add_middleware(tus.Wire)
+    app.include_router(library, dependencies=[Depends(_verify_checksum)])
+    app.add_middleware(tus.TusMiddleware)
