@@ -15,7 +15,7 @@ MAKE_EXPORT = "make_export"
 """Workflow with one argument, the export's id, which is also the workflow's."""
 APPLICATION = "specimap"
 APPLICATION_VERSION = "1"
-"""Fixed: by default it is a hash of the code, and a new version would never take up an old one's jobs."""
+"""Fixed: by default it is a hash of the code, and a new version would never run the jobs of an old one."""
 POLL_SECONDS = 0.25
 
 

@@ -81,5 +81,5 @@ def status_of(error: SpecimapError) -> int:
 
 
 def error_class(status: int) -> type[SpecimapError]:
-    """Return the error that stands for a status which no error of ours led to."""
+    """Return the error class for a status that the web framework or the tus library answered with."""
     return _CLASSES.get(status, SpecimapError if status >= 500 else service.RequestInvalidError)

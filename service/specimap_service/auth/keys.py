@@ -24,7 +24,7 @@ PREFIX = "spk"
 
 @dataclass(frozen=True)
 class Principal:
-    """The key that a request came with."""
+    """The key of a request."""
 
     key_id: str
     scopes: frozenset[str]

@@ -31,7 +31,7 @@ EXAMPLE: dict[str, Any] = {
 
 
 class LabelClass(BaseModel):
-    """The class that a number stands for."""
+    """A class: its number, name and colour."""
 
     model_config = ConfigDict(extra="forbid")
 

@@ -112,7 +112,7 @@ def _create_once(
             (view,) = job_views(session, [job])
             return view, True
     except IntegrityError as error:
-        # The same request came twice at once, or the acquisition was deleted meanwhile.
+        # The same request was made twice at once, or the acquisition was deleted.
         earlier = _find_repeated(context, key_id, idempotency_key, digest)
         if earlier is None:
             raise _no_acquisition(job.acquisition_id) from error

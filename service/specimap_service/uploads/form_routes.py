@@ -63,7 +63,7 @@ class _FormLimits:
         self._disk_checked_at = 0
 
     def begin(self, role: str, files: int) -> None:
-        """Check that one more file may come."""
+        """Check that one more file may be added."""
         if role == "photo":
             self._photos += 1
             with self._context.database.session() as session:
@@ -106,7 +106,7 @@ async def add_files(
 
 
 def _limits(context: AppContext, principal: Principal, request: Request, acquisition_id: str) -> _FormLimits:
-    """Refuse before the body is read what can be refused then; return the limits for the rest."""
+    """Check before the body is read whatever can be checked then; return the limits for the rest."""
     length = request.headers.get("content-length", "0")
     announced = int(length) if length.isdecimal() else 0
     settings = context.settings

@@ -98,7 +98,7 @@ class UploadStore(TusStorage):
             await asyncio.to_thread(self._write, self._locked[uid], sync=True)
 
     def _write(self, held: _LockedFile, *, sync: bool) -> None:
-        # A failure is raised again when the lock is released: raised here, the library would answer it with success.
+        # Raised again when the lock is released: the library would answer a failure here with success.
         self._received(held.write(self._files.folder, sync=sync))
 
     async def finalize(self, uid: str) -> None:
