@@ -188,7 +188,7 @@ class Artefact(Base):
 
 
 class CloudRow(Base):
-    """A finished result: a folder ``prefix`` in the storage with cloud.zarr, mesh.ply, report.json and further files."""
+    """A finished result: a folder ``prefix`` in the storage with cloud.zarr, mesh.ply, report.json and others."""
 
     __tablename__ = "clouds"
 
