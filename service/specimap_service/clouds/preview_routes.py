@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Depends, Path, Query, Request, Response
 
 from specimap_core import __version__
 from specimap_core.cloud import Cloud
@@ -25,7 +26,9 @@ from specimap_service.errors import RequestInvalidError
 router = APIRouter(prefix="/v1/clouds/{cloud_id}/previews", tags=["previews"])
 CloudId = Annotated[str, Path(pattern=r"^cloud_[0-9a-z]{26}$")]
 Size = Annotated[int, Query(ge=16, le=LARGEST_SIDE, description="Most pixels of the longer side; never enlarged.")]
-Where = Annotated[Grid, Query(description="`cube`: the cube's own pixels; `marker`: from above, x to the right, y up.")]
+GridChoice = Annotated[
+    Grid, Query(description="`cube`: the cube's own pixels; `marker`: from above, x to the right, y up.")
+]
 Low = Annotated[
     float | None,
     Query(allow_inf_nan=False, description="Value at the lower end of the scale; by default the 2nd percentile."),
@@ -63,53 +66,86 @@ PNG: dict[int | str, dict[str, Any]] = {
 }
 
 
+@dataclass(frozen=True)
+class Previews:
+    """Answers to one request with a picture of a cloud, drawn or cached."""
+
+    clouds: OpenClouds
+    cache: PictureCache
+    request: Request
+
+    def picture(self, cloud_id: str, grid: Grid, size: int, paint: Paint, parameters: list[Any]) -> Response:
+        """Answer with a picture; ``parameters`` are everything else that it depends on."""
+        self.clouds.record(cloud_id)
+        # A cloud never changes: parameters and program version identify the picture.
+        identity = json_text([__version__, cloud_id, grid, size, *parameters])
+        tag = hashlib.sha256(identity.encode()).hexdigest()[:32]
+        headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache", "Vary": "Authorization"}
+        known = [part.strip().removeprefix("W/") for part in self.request.headers.get("if-none-match", "").split(",")]
+        if f'"{tag}"' in known or "*" in known:
+            return Response(status_code=304, headers=headers)
+
+        def draw() -> Picture:
+            with self.clouds.reading(cloud_id) as (_, cloud):
+                return pictures.draw(cloud, paint(cloud), grid, size)
+
+        picture = self.cache.get(tag, draw)
+        if picture.range is not None:
+            headers["X-Specimap-Range"] = ",".join(f"{value:.6g}" for value in picture.range)
+        if picture.extent_mm is not None:
+            headers["X-Specimap-Extent-Mm"] = ",".join(f"{value:.4f}" for value in picture.extent_mm)
+        return Response(picture.png, headers=headers, media_type="image/png")
+
+
+async def previews_of_request(request: Request, clouds: CloudsDep, cache: PicturesDep) -> Previews:
+    """Combine the objects that pictures need: a dependency, ``async`` so that it takes no thread."""
+    return Previews(clouds, cache, request)
+
+
+PreviewsDep = Annotated[Previews, Depends(previews_of_request)]
+
+
 @router.get("/rgb.png", response_class=Response, responses=PNG)
 def rgb(
     principal: Reader,
-    clouds: CloudsDep,
-    cache: PicturesDep,
-    request: Request,
+    previews: PreviewsDep,
     cloud_id: CloudId,
     size: Size = 1024,
-    grid: Where = "cube",
+    grid: GridChoice = "cube",
 ) -> Response:
     """Show the photos' colours."""
-    return _picture(clouds, cache, request, cloud_id, grid, size, pictures.paint_rgb, ["rgb"])
+    return previews.picture(cloud_id, grid, size, pictures.paint_rgb, ["rgb"])
 
 
 @router.get("/pca.png", response_class=Response, responses=PNG)
 def pca(
     context: Context,
     principal: Reader,
-    clouds: CloudsDep,
-    cache: PicturesDep,
-    request: Request,
+    previews: PreviewsDep,
     cloud_id: CloudId,
     size: Size = 1024,
-    grid: Where = "cube",
+    grid: GridChoice = "cube",
 ) -> Response:
     """Show the first three principal components of the spectra as colours, as the run drew them."""
 
     def paint(cloud: Cloud) -> PointColours:
-        prefix = clouds.record(cloud_id).prefix
+        prefix = previews.clouds.record(cloud_id).prefix
         return pictures.paint_pca(cloud, context.storage.read(f"{prefix}/preview.png"))
 
-    return _picture(clouds, cache, request, cloud_id, grid, size, paint, ["pca"])
+    return previews.picture(cloud_id, grid, size, paint, ["pca"])
 
 
 @router.get("/band.png", response_class=Response, responses=PNG)
 def band(
     principal: Reader,
-    clouds: CloudsDep,
-    cache: PicturesDep,
-    request: Request,
+    previews: PreviewsDep,
     cloud_id: CloudId,
     b: Annotated[str | None, _band("The band")] = None,
     nm: Annotated[float | None, Query(gt=0, lt=100_000, description="The band nearest to this, instead of b.")] = None,
     low: Low = None,
     high: High = None,
     size: Size = 1024,
-    grid: Where = "cube",
+    grid: GridChoice = "cube",
 ) -> Response:
     """Show one band in grey."""
     if (b is None) == (nm is None):
@@ -119,21 +155,19 @@ def band(
     def paint(cloud: Cloud) -> PointColours:
         return pictures.paint_band(cloud, pictures.band_index(cloud, chosen), limits)
 
-    return _picture(clouds, cache, request, cloud_id, grid, size, paint, ["band", chosen, limits])
+    return previews.picture(cloud_id, grid, size, paint, ["band", chosen, limits])
 
 
 @router.get("/composite.png", response_class=Response, responses=PNG)
 def composite(
     principal: Reader,
-    clouds: CloudsDep,
-    cache: PicturesDep,
-    request: Request,
+    previews: PreviewsDep,
     cloud_id: CloudId,
     r: Annotated[str, _band("Band shown in red")] = TRUE_COLOUR[0],
     g: Annotated[str, _band("Band shown in green")] = TRUE_COLOUR[1],
     b: Annotated[str, _band("Band shown in blue")] = TRUE_COLOUR[2],
     size: Size = 1024,
-    grid: Where = "cube",
+    grid: GridChoice = "cube",
 ) -> Response:
     """Show three bands as red, green and blue, each between its 2nd and 98th percentile."""
 
@@ -141,22 +175,20 @@ def composite(
         red, green, blue = (pictures.band_index(cloud, given) for given in (r, g, b))
         return pictures.paint_composite(cloud, (red, green, blue))
 
-    return _picture(clouds, cache, request, cloud_id, grid, size, paint, ["composite", r, g, b])
+    return previews.picture(cloud_id, grid, size, paint, ["composite", r, g, b])
 
 
 @router.get("/index.png", response_class=Response, responses=PNG)
 def index(
     principal: Reader,
-    clouds: CloudsDep,
-    cache: PicturesDep,
-    request: Request,
+    previews: PreviewsDep,
     cloud_id: CloudId,
     a: Annotated[str, _band("First band")],
     b: Annotated[str, _band("Second band")],
     low: Low = None,
     high: High = None,
     size: Size = 1024,
-    grid: Where = "cube",
+    grid: GridChoice = "cube",
 ) -> Response:
     """Show the normalised difference (a - b) / (a + b) as a colour scale; transparent where a + b is not positive."""
     limits = _limits(low, high)
@@ -165,16 +197,14 @@ def index(
         first, second = (pictures.band_index(cloud, given) for given in (a, b))
         return pictures.paint_index(cloud, first, second, limits)
 
-    return _picture(clouds, cache, request, cloud_id, grid, size, paint, ["index", a, b, limits])
+    return previews.picture(cloud_id, grid, size, paint, ["index", a, b, limits])
 
 
 @router.get("/label.png", response_class=Response, responses=PNG)
 def label(
     context: Context,
     principal: Reader,
-    clouds: CloudsDep,
-    cache: PicturesDep,
-    request: Request,
+    previews: PreviewsDep,
     cloud_id: CloudId,
     name: Annotated[str, Query(pattern=r"^[a-z0-9_-]{1,64}$", description="The layer.")],
     version: Annotated[int | None, Query(ge=1, le=10**9, description="By default the current one.")] = None,
@@ -185,11 +215,11 @@ def label(
     low: Low = None,
     high: High = None,
     size: Size = 1024,
-    grid: Where = "cube",
+    grid: GridChoice = "cube",
 ) -> Response:
     """Show a label layer over the dimmed photos: classes in their colours, probabilities on a scale from 0 to 1."""
     limits = _limits(low, high)
-    clouds.record(cloud_id)
+    previews.clouds.record(cloud_id)
     with context.database.session() as session:
         row = find_label(session, cloud_id, name, version)
     record = LabelRecord(row.name, row.version, row.kind, row.storage_prefix)
@@ -202,7 +232,7 @@ def label(
         )
 
     def paint(cloud: Cloud) -> PointColours:
-        array = clouds.label_array(record)
+        array = previews.clouds.label_array(record)
         values = array.read(0, array.shape[0])
         if row.kind == "class":
             return pictures.paint_classes(cloud, values, row.classes)
@@ -210,7 +240,7 @@ def label(
         return pictures.paint_probability(cloud, values.reshape(len(values), -1)[:, column], limits)
 
     parameters = ["label", row.storage_prefix, class_value, limits]
-    return _picture(clouds, cache, request, cloud_id, grid, size, paint, parameters)
+    return previews.picture(cloud_id, grid, size, paint, parameters)
 
 
 def _limits(low: float | None, high: float | None) -> tuple[float, float] | None:
@@ -219,35 +249,3 @@ def _limits(low: float | None, high: float | None) -> tuple[float, float] | None
     if low is None or high is None or not low < high:
         raise RequestInvalidError("low and high are no range.", advice="Give both, low below high, or neither.")
     return low, high
-
-
-def _picture(
-    clouds: OpenClouds,
-    cache: PictureCache,
-    request: Request,
-    cloud_id: str,
-    grid: Grid,
-    size: int,
-    paint: Paint,
-    parameters: list[Any],
-) -> Response:
-    """Answer with a picture; ``parameters`` are everything else that it depends on."""
-    clouds.record(cloud_id)
-    # A cloud never changes: parameters and program version identify the picture.
-    identity = json_text([__version__, cloud_id, grid, size, *parameters])
-    tag = hashlib.sha256(identity.encode()).hexdigest()[:32]
-    headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache", "Vary": "Authorization"}
-    known = [part.strip().removeprefix("W/") for part in request.headers.get("if-none-match", "").split(",")]
-    if f'"{tag}"' in known or "*" in known:
-        return Response(status_code=304, headers=headers)
-
-    def draw() -> Picture:
-        with clouds.reading(cloud_id) as (_, cloud):
-            return pictures.draw(cloud, paint(cloud), grid, size)
-
-    picture = cache.get(tag, draw)
-    if picture.range is not None:
-        headers["X-Specimap-Range"] = ",".join(f"{value:.6g}" for value in picture.range)
-    if picture.extent_mm is not None:
-        headers["X-Specimap-Extent-Mm"] = ",".join(f"{value:.4f}" for value in picture.extent_mm)
-    return Response(picture.png, headers=headers, media_type="image/png")
