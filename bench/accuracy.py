@@ -16,7 +16,7 @@ from bench.real import APPLE, bench_apple
 from bench.sample import SAMPLE
 from specimap_core.truth.judge import TruthComparison, judge
 from specimap_validation.phantom import PhantomSettings, write_phantom
-from specimap_validation.photo_subsets import evenly
+from specimap_validation.photo_subsets import even_subset
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def bench_accuracy(console: Console, work: Path, repeats: int) -> dict[str, obje
             write_phantom(case.made_of, case.folder)
         photos, out = work / f"case_{number}", work / f"case_{number}_out"
         photos.mkdir(exist_ok=True)
-        used = evenly(sorted((case.folder / "rgb").iterdir()), case.share)
+        used = even_subset(sorted((case.folder / "rgb").iterdir()), case.share)
         if case.size:
             enlarge(used, photos, case.size)
         for photo in () if case.size else used:

@@ -29,6 +29,16 @@ MAY_IMPORT = {
     "cli": {"core", "infra", "workers", "service", "validation", "cli", "client"},
     "validation": {"core", "validation"},
 }
+FEATURE_IMPORTS = {
+    "auth": set(),
+    "clouds": {"auth"},
+    "jobs": {"auth", "clouds"},  # deleting a job closes its clouds
+    "acquisitions": {"auth", "jobs", "clouds"},  # deleting an acquisition removes its jobs' results
+    "uploads": {"auth", "acquisitions"},  # an upload becomes a file of an acquisition
+}
+"""Features of the service, and which others each may import."""
+SHARED_IMPORTS = {"health": {"auth"}, "body_limits": {"auth"}, "app": set(FEATURE_IMPORTS)}
+"""Modules beside the features that may import some; all others import none."""
 HEAVY = ("cv2", "open3d", "pycolmap", "embreex", "scipy", "torch")
 LIGHT = (
     "specimap_core.cloud",
@@ -68,6 +78,34 @@ def test_imports_point_down(folder: str) -> None:
         own = {name.split(".")[0] for name in imported(path.read_text("utf-8")) if name.startswith("specimap")}
         wrong += [f"{path.relative_to(ROOT)} imports {name}" for name in sorted(own - allowed)]
     assert wrong == []
+
+
+def imported_features(path: Path) -> set[str]:
+    names = [name.split(".") for name in imported(path.read_text("utf-8"))]
+    return {name[1] for name in names if name[0] == "specimap_service" and name[1] in FEATURE_IMPORTS}
+
+
+def test_features_of_the_service_import_only_the_features_they_build_on() -> None:
+    service = ROOT / "service" / "specimap_service"
+    assert {path.parent.name for path in service.glob("*/__init__.py")} == set(FEATURE_IMPORTS)
+    for path in modules("service"):
+        folder = path.parent.name
+        allowed = FEATURE_IMPORTS[folder] | {folder} if path.parent != service else SHARED_IMPORTS.get(path.stem, set())
+        assert imported_features(path) <= allowed, path.relative_to(service)
+    assert imported_features(service / "context.py") == set()
+
+
+def test_features_build_on_each_other_without_a_circle() -> None:
+    # Each feature may import only those named before it.
+    for number, allowed in enumerate(FEATURE_IMPORTS.values()):
+        assert allowed <= set(list(FEATURE_IMPORTS)[:number])
+
+
+@pytest.mark.parametrize("folder", [folder for folder in FOLDERS if folder not in ("service", "cli")])
+def test_only_the_service_knows_http_statuses(folder: str) -> None:
+    for path in modules(folder):
+        roots = {name.split(".")[0] for name in imported(path.read_text("utf-8"))}
+        assert not roots & {"fastapi", "starlette", "http"}, path.relative_to(ROOT)
 
 
 def test_no_module_imports_open3d() -> None:

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from specimap_cli.doctor import doctor
-from specimap_cli.errors import Debug, stoppable, told
+from specimap_cli.errors import Debug, reported_errors, stoppable
 from specimap_cli.keys import keys_app
 from specimap_cli.progress import Listener, json_listener, progress_listener
 from specimap_cli.report import report
@@ -108,7 +108,7 @@ def run(
 ) -> None:
     """Reconstruct, adjust, render, register; write cloud.zarr, mesh.ply, report.json, corners.json, preview.png."""
     listener: Listener = json_listener() if json_events else progress_listener()
-    with told(listener, debug), stoppable() as stop_asked:
+    with reported_errors(listener, debug), stoppable() as stop_asked:
         # Imported late: `specimap --help` and `specimap info` need none of the 3D libraries.
         from specimap_core.pipeline.outputs import Inputs, Outputs
         from specimap_core.pipeline.run import run_pipeline
@@ -143,7 +143,7 @@ def info(
     debug: Debug = False,
 ) -> None:
     """Print the report of a run."""
-    with told(json_listener() if json_events else progress_listener(), debug):
+    with reported_errors(json_listener() if json_events else progress_listener(), debug):
         from specimap_cli.tables import print_report
         from specimap_core.report.model import read_report
 
@@ -163,7 +163,7 @@ def export(
     debug: Debug = False,
 ) -> None:
     """Write the cloud in another format."""
-    with told(json_listener() if json_events else progress_listener(), debug):
+    with reported_errors(json_listener() if json_events else progress_listener(), debug):
         from specimap_core.cloud import Cloud
         from specimap_core.export import export_cloud
 
@@ -183,7 +183,7 @@ def serve(
     debug: Debug = False,
 ) -> None:
     """Start the service: API and workers. Settings come from SPECIMAP_ variables; docs/settings.md lists them."""
-    with told(progress_listener(), debug):
+    with reported_errors(progress_listener(), debug):
         from specimap_cli.serve import serve as run_service
 
         run_service(workers=worker, say=typer.echo)
@@ -196,7 +196,7 @@ def worker(
     debug: Debug = False,
 ) -> None:
     """Start workers for a service that runs elsewhere, on the same database and storage."""
-    with told(progress_listener(), debug):
+    with reported_errors(progress_listener(), debug):
         from specimap_cli.serve import work
 
         work(slots=slots, kind=kind.value)
@@ -213,7 +213,7 @@ def demo(
 ) -> None:
     """Run the sample through a service of its own: upload, job, progress, report, link."""
     listener = progress_listener()
-    with told(listener, debug):
+    with reported_errors(listener, debug):
         from specimap_cli.demo import demo as run_demo
 
         run_demo(samples, out, listener, stay=sys.stdout.isatty() if stay is None else stay, say=typer.echo)

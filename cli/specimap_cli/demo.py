@@ -31,7 +31,7 @@ def demo(samples: Path, out: Path, listener: Listener, *, stay: bool, say: Calla
     Raises:
         NotFoundError: there is no sample.
         BackendUnavailableError: the client is not installed, or the service does not start.
-        SpecimapError: its leaves, as the service answers them.
+        SpecimapError: with the code of an error of the service.
     """
     try:
         from specimap_client import ApiError, Client, JobFailed
@@ -49,9 +49,11 @@ def demo(samples: Path, out: Path, listener: Listener, *, stay: bool, say: Calla
                 _run(client, photos, cube, out, listener, say)
         except JobFailed as failed:
             why = failed.job.error
-            raise _again(failed.code, why.message if why else str(failed), why.advice if why else "") from failed
+            raise _error_of_service(
+                failed.code, why.message if why else str(failed), why.advice if why else ""
+            ) from failed
         except ApiError as refused:
-            raise _again(refused.code, refused.message, refused.advice) from refused
+            raise _error_of_service(refused.code, refused.message, refused.advice) from refused
         if stay:
             say(f"The service goes on: the API is described at {url}/docs, the demo's key is {key}")
             say("Ctrl-C ends it.")
@@ -92,8 +94,8 @@ def _run(
     say(f"{'link':<12} {client.url}/v1/clouds/{cloud.id}")
 
 
-def _again(code: str, message: str, advice: str) -> SpecimapError:
-    """The service's error as one of ours, with its code."""
+def _error_of_service(code: str, message: str, advice: str) -> SpecimapError:
+    """Make one of our errors from the service's, with its code."""
     leaf = type("ServiceError", (SpecimapError,), {"code": code})
     error = leaf(message, advice=advice)
     assert isinstance(error, SpecimapError)
@@ -102,7 +104,7 @@ def _again(code: str, message: str, advice: str) -> SpecimapError:
 
 @contextmanager
 def _service(folder: Path) -> Iterator[tuple[str, str]]:
-    """A service on a folder and a free port: its address and a new administrator's key."""
+    """Start a service on a folder and a free port; yield its address and a new administrator's key."""
     remove(folder)
     folder.mkdir(parents=True, mode=0o700)
     environment = {
@@ -121,7 +123,7 @@ def _service(folder: Path) -> Iterator[tuple[str, str]]:
         text=True,
     )
     try:
-        yield _told(process, folder / "service.log")
+        yield _read_address_and_key(process, folder / "service.log")
     finally:
         process.terminate()
         try:
@@ -132,8 +134,8 @@ def _service(folder: Path) -> Iterator[tuple[str, str]]:
         log.close()
 
 
-def _told(process: subprocess.Popen[str], log: Path) -> tuple[str, str]:
-    """Address and key, as the service prints them."""
+def _read_address_and_key(process: subprocess.Popen[str], log: Path) -> tuple[str, str]:
+    """Wait for the address and the key that the service prints."""
     found: dict[str, str] = {}
     complete = threading.Event()
 

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from specimap_cli.errors import FAILED, Debug, told
+from specimap_cli.errors import FAILED, Debug, reported_errors
 from specimap_cli.progress import json_listener, progress_listener
 from specimap_core.json_text import json_text
 
@@ -28,7 +28,7 @@ def doctor(
     debug: Debug = False,
 ) -> None:
     """Tell which backends, features and devices are usable, and what is missing."""
-    with told(json_listener() if json_events else progress_listener(), debug):
+    with reported_errors(json_listener() if json_events else progress_listener(), debug):
         from specimap_core.reconstruct.backends.doctor import diagnose
         from specimap_core.sandbox import protection
 

@@ -1,4 +1,4 @@
-"""What every command shares: exit statuses, errors told by code and advice, stopping in order."""
+"""Shared by all commands: exit statuses, errors reported by code and advice, orderly stops."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from specimap_core.errors import CancelledError, MemoryExhaustedError, SpecimapE
 REFUSED = 2
 """Exit status of a refused input."""
 FAILED = 1
-"""Exit status where the program itself failed: an error that nobody foresaw."""
+"""Exit status where the program itself failed: an unforeseen error."""
 STOPPED = 130
 DEBUG_VARIABLE = "SPECIMAP_DEBUG"
 
@@ -29,16 +29,16 @@ Debug = Annotated[
 
 @contextmanager
 def stoppable() -> Iterator[Callable[[], bool]]:
-    """Let SIGINT and SIGTERM ask for a stop at the next step; asked twice, the program ends at once."""
-    asked: list[int] = []
+    """Let SIGINT and SIGTERM request a stop at the next step; a second one ends the program at once."""
+    signals: list[int] = []
 
     def stop(number: int, _: object) -> None:
-        asked.append(number)
+        signals.append(number)
         signal.signal(number, signal.SIG_DFL)
 
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield lambda: bool(asked)
+        yield lambda: bool(signals)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -51,8 +51,8 @@ def _status(error: SpecimapError) -> int:
 
 
 @contextmanager
-def told(listener: Listener, debug: bool) -> Iterator[None]:
-    """Tell of any error by its code and advice, never by a traceback, and exit accordingly."""
+def reported_errors(listener: Listener, debug: bool) -> Iterator[None]:
+    """Report any error of the block by its code and advice, not by a traceback, and exit accordingly."""
     try:
         yield
     except SpecimapError as error:
@@ -61,7 +61,7 @@ def told(listener: Listener, debug: bool) -> Iterator[None]:
         listener.refused(error)
         raise typer.Exit(_status(error)) from None
     except BrokenPipeError:
-        # Who reads the output has gone; Python would complain once more when it flushes at exit.
+        # The reader of the output has closed it; Python would report that again when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise typer.Exit(FAILED) from None
     except Exception as error:

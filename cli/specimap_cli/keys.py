@@ -1,4 +1,4 @@
-"""``specimap keys``: made, listed, revoked straight in the database, for whoever runs the service."""
+"""``specimap keys``: create, list and revoke keys directly in the database, for the administrator."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from sqlalchemy.orm import Session
 
 AUDITED_AS = "cli"
-"""Stands for the key in the audit trail: whoever reaches the database needs none."""
+"""Stands for the key in the audit trail: access to the database needs no key."""
 
 keys_app = typer.Typer(no_args_is_help=True, help="Keys to the API: create, list, revoke.")
 
 
 class Scope(StrEnum):
-    """What a key may do; admin may do everything."""
+    """Scopes of a key; admin includes all."""
 
     upload = "upload"
     read = "read"
@@ -52,12 +52,12 @@ def create(
 
         if not 1 <= len(name) <= 100:
             raise SettingsError("A name has 1 to 100 characters.", advice="Give another --name.", setting="name")
-        until = None if expires is None else expires.replace(tzinfo=datetime.UTC)
-        if until is not None and until <= utc_now():
+        expires_at = None if expires is None else expires.replace(tzinfo=datetime.UTC)
+        if expires_at is not None and expires_at <= utc_now():
             raise SettingsError(
-                f"{until.isoformat()} has passed.", advice="Give a later time to --expires.", setting="expires"
+                f"{expires_at.isoformat()} has passed.", advice="Give a later time to --expires.", setting="expires"
             )
-        row, key = new_key(name, [s.value for s in scope], expires_at=until)
+        row, key = new_key(name, [s.value for s in scope], expires_at=expires_at)
         session.add(row)
         audit(session, AUDITED_AS, "key.create", row.id, scopes=row.scopes)
     typer.echo(f"Key {row.id} may: {', '.join(row.scopes)}. It is shown this once.", err=True)
@@ -76,17 +76,17 @@ def list_keys(as_json: Annotated[bool, typer.Option("--json", help="One JSON lin
         rows, now = list(session.scalars(sa.select(ApiKey).order_by(ApiKey.id))), utc_now()
     table = Table("id", "name", "scopes", "created", "last used", "state", box=None)
     for row in rows:
-        ended = "revoked" if row.revoked_at else "expired" if row.expires_at and row.expires_at <= now else "valid"
+        state = "revoked" if row.revoked_at else "expired" if row.expires_at and row.expires_at <= now else "valid"
         if as_json:
             times = {name: getattr(row, name) for name in ("created_at", "last_used_at", "expires_at", "revoked_at")}
-            told = {name: value.isoformat() if value else None for name, value in times.items()}
-            line = {"id": row.id, "name": row.name, "scopes": row.scopes, "state": ended, **told}
+            dates = {name: value.isoformat() if value else None for name, value in times.items()}
+            line = {"id": row.id, "name": row.name, "scopes": row.scopes, "state": state, **dates}
             sys.stdout.write(json_text(line) + "\n")
             continue
         used = row.last_used_at.isoformat(" ", "minutes") if row.last_used_at else "never"
-        table.add_row(row.id, row.name, " ".join(row.scopes), row.created_at.isoformat(" ", "minutes"), used, ended)
+        table.add_row(row.id, row.name, " ".join(row.scopes), row.created_at.isoformat(" ", "minutes"), used, state)
     if not as_json:
-        # A terminal is as wide as it is, but what goes elsewhere is not cut.
+        # Output to a file or a pipe is not cut at a terminal's width.
         console = Console(markup=False)
         console.print(table) if console.is_terminal else Console(width=300, markup=False).print(table)
 
@@ -110,7 +110,7 @@ def revoke(key_id: Annotated[str, typer.Argument(help="Its id, key_…, as `spec
 
 @contextmanager
 def _transaction() -> Iterator[Session]:
-    """A transaction on the database that the settings name; an error is told with its advice, and exits 2."""
+    """Open a transaction on the database that the settings name; report an error with its advice, and exit with 2."""
     try:
         # Imported late: `specimap --help` and `specimap run` need none of the service's libraries.
         from specimap_infra.database import Database

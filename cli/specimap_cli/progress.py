@@ -1,4 +1,4 @@
-"""How a run tells of itself: bars on a terminal, or one JSON line per event."""
+"""Progress of a run: bars on a terminal, or one JSON line for each event."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ STAGE_WORDS = {
 
 
 class Listener(Protocol):
-    """Hears of a run."""
+    """An object that is notified of a run's progress and end."""
 
     def __enter__(self) -> Self: ...
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None: ...
     def progress(self, stage: str, share: float) -> None:
-        """A stage has come so far, 0..1."""
+        """A stage has reached this share of its work, 0..1."""
         ...
 
     def finished(self, report: Report, outputs: Outputs) -> None:
-        """The run is whole."""
+        """The run is finished."""
         ...
 
     def report(self, report: Report) -> None:
-        """A run that another process did is whole."""
+        """A run by another process is finished."""
         ...
 
     def refused(self, error: SpecimapError) -> None:
@@ -107,7 +107,7 @@ class _Lines:
     ) -> None:
         return None
 
-    def _say(self, **event: object) -> None:
+    def _write(self, **event: object) -> None:
         sys.stdout.write(json_text(event) + "\n")
         sys.stdout.flush()
 
@@ -115,30 +115,30 @@ class _Lines:
         step = stage, int(share * 100)
         if step != self._last:
             self._last = step
-            self._say(event="progress", stage=stage, share=round(share, 4))
+            self._write(event="progress", stage=stage, share=round(share, 4))
 
     def report(self, report: Report) -> None:
-        self._say(event="finished", report=report.model_dump(mode="json"))
+        self._write(event="finished", report=report.model_dump(mode="json"))
 
     def finished(self, report: Report, outputs: Outputs) -> None:
-        self._say(event="finished", out=str(outputs.folder), report=report.model_dump(mode="json"))
+        self._write(event="finished", out=str(outputs.folder), report=report.model_dump(mode="json"))
 
     def refused(self, error: SpecimapError) -> None:
-        self._say(event="refused", **error.as_dict())
+        self._write(event="refused", **error.as_dict())
 
 
 def progress_listener() -> Listener:
-    """Bars for a person."""
+    """Make bars for a person."""
     return _Bars()
 
 
 def json_listener() -> Listener:
-    """Lines for a program."""
+    """Make JSON lines for a program."""
     return _Lines()
 
 
 class UploadBar:
-    """A bar for files on their way."""
+    """A bar for files being uploaded."""
 
     def __init__(self) -> None:
         self._progress = Progress(

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from specimap_cli.errors import Debug, told
+from specimap_cli.errors import Debug, reported_errors
 from specimap_cli.progress import json_listener, progress_listener
 from specimap_core.json_text import json_text
 
@@ -32,7 +32,7 @@ def report(
     debug: Debug = False,
 ) -> None:
     """Write the accuracy report of a run: verdict, figures, photos with their corners, maps, settings."""
-    with told(json_listener() if json_events else progress_listener(), debug):
+    with reported_errors(json_listener() if json_events else progress_listener(), debug):
         from specimap_core.report.document import write_document
 
         written = write_document(out, target or out / f"report.{format.value}", format.value, truth=truth)

@@ -15,7 +15,7 @@ from specimap_core.sandbox import hide_from_others
 from specimap_infra.confinement import check_confinement
 from specimap_infra.database import Database
 from specimap_infra.logs import set_up_logs
-from specimap_infra.migrate import alone, migrate
+from specimap_infra.migrate import exclusive_lock, migrate
 from specimap_infra.settings import ServiceSettings, load_settings
 from specimap_infra.storage import Storage
 from specimap_infra.tables import SCOPES, ApiKey
@@ -28,7 +28,7 @@ def serve(*, workers: bool, say: Callable[[str], None]) -> None:
     """Run the API, and a worker for each slot, until SIGINT or SIGTERM.
 
     Raises:
-        SettingsError, DatabaseUnavailableError, StorageUnavailableError: nothing was started then.
+        SettingsError, DatabaseUnavailableError, StorageUnavailableError: before anything was started.
     """
     import uvicorn
 
@@ -75,7 +75,7 @@ def serve(*, workers: bool, say: Callable[[str], None]) -> None:
         timeout_keep_alive=75,
         http=Connection,
     )
-    # The server raises the signal that stopped it once more at its end: the workers still have to be ended then.
+    # The server raises the signal that stopped it again at its end, when the workers have still to be stopped.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: None)
     supervisor.start()
@@ -89,7 +89,7 @@ def work(*, slots: int | None, kind: str) -> None:
     """Run workers until SIGINT or SIGTERM.
 
     Raises:
-        SettingsError, DatabaseUnavailableError, StorageUnavailableError: nothing was started then.
+        SettingsError, DatabaseUnavailableError, StorageUnavailableError: before anything was started.
     """
     settings = load_settings()
     set_up_logs(settings)
@@ -119,7 +119,7 @@ def work(*, slots: int | None, kind: str) -> None:
 
 
 def _listen(settings: ServiceSettings) -> socket.socket:
-    """The listening socket, taken first: two services on one port would share a database by accident."""
+    """Bind the listening socket, before all else: two services on one port would share a database by accident."""
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -137,10 +137,10 @@ def _listen(settings: ServiceSettings) -> socket.socket:
 
 
 def _first_key(database: Database) -> str | None:
-    """An administrator's key where there is no key at all."""
+    """Create an administrator's key if there is no key at all."""
     from specimap_service.auth.keys import new_key
 
-    with alone(database.engine), database.session() as session:
+    with exclusive_lock(database.engine), database.session() as session:
         if session.scalar(sa.select(sa.func.count()).select_from(ApiKey)):
             return None
         row, key = new_key("administrator", SCOPES)

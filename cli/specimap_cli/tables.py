@@ -1,4 +1,4 @@
-"""The report as a table."""
+"""Print a report as tables."""
 
 from __future__ import annotations
 

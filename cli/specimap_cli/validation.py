@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from specimap_cli.errors import Debug, stoppable, told
+from specimap_cli.errors import Debug, reported_errors, stoppable
 from specimap_cli.progress import Listener, json_listener, progress_listener
 from specimap_core.errors import SettingsError
 from specimap_core.json_text import json_text
@@ -44,7 +44,7 @@ def subsampling(
 ) -> None:
     """Run on 100 % to 50 % of the photos: subsampling.json, subsampling.html, figures of 2D and 3D error."""
     listener: Listener = json_listener() if json_events else progress_listener()
-    with told(listener, debug), stoppable() as stop_asked:
+    with reported_errors(listener, debug), stoppable() as stop_asked:
         from specimap_core.pipeline.settings import settings_from
         from specimap_validation.capture import find_capture
         from specimap_validation.pages import check_drawing, publish_study
@@ -66,7 +66,7 @@ def subsampling(
         capture = find_capture(acquisition)
         check_drawing()
 
-        def heard(row: Row) -> None:
+        def on_row(row: Row) -> None:
             if json_events:
                 _say(event="run", **row.model_dump(mode="json"))
 
@@ -78,7 +78,7 @@ def subsampling(
                 shares=wanted,
                 seeds=seeds,
                 progress=lambda share: listener.progress("study", share),
-                heard=heard,
+                on_row=on_row,
                 cancelled=stop_asked,
             )
             written = publish_study(study, out)
@@ -100,7 +100,7 @@ def validate(
 ) -> None:
     """Judge both registrations and both adjustments against truth, on phantoms with one defect each."""
     listener: Listener = json_listener() if json_events else progress_listener()
-    with told(listener, debug), stoppable() as stop_asked:
+    with reported_errors(listener, debug), stoppable() as stop_asked:
         from specimap_validation import validation as v
         from specimap_validation.cases import cases
         from specimap_validation.page_marks import check_marks, put
@@ -113,7 +113,7 @@ def validate(
         if update_docs is not None:
             check_marks(update_docs, v.MARK)
 
-        def heard(row: v.Row) -> None:
+        def on_row(row: v.Row) -> None:
             if json_events:
                 _say(event="run", **row.model_dump(mode="json"))
 
@@ -123,7 +123,7 @@ def validate(
                 out,
                 quick=quick,
                 progress=lambda share: listener.progress("validate", share),
-                heard=heard,
+                on_row=on_row,
                 cancelled=stop_asked,
             )
             written = publish_validation(validation, out)

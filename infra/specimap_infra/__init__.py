@@ -1,1 +1,1 @@
-"""What the API and the workers share: settings, database, storage, job queue, logs. Pulls no 3D vision package."""
+"""Parts that the API and the workers share: settings, database, storage, job queue, logs. No 3D vision package."""

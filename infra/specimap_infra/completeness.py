@@ -1,4 +1,4 @@
-"""What an acquisition still lacks before a job can run on it. Reads rows only, no file."""
+"""Check which files an acquisition lacks before a job can run on it. Reads rows only, no file."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from sqlalchemy.orm import Session
 from specimap_infra.tables import StoredFile
 
 LEAST_PHOTOS = 6
-"""As the pipeline has it; fewer are refused there."""
+"""The pipeline's own limit; it refuses fewer."""
 HEADER, DATA = ".hdr", ".raw"
-"""Ends of the labels of a cube in two files; any other is whole in itself."""
+"""Suffixes of a cube in two files; a file with any other suffix is a whole cube."""
 
 
 def missing(session: Session, acquisition_id: str) -> list[str]:
-    """A sentence for each thing that is missing; empty where a job can run. Refused files do not count."""
+    """Return a sentence for each missing file; empty where a job can run. Refused files do not count."""
     accepted = session.execute(
         sa.select(StoredFile.role, StoredFile.label).where(
             StoredFile.acquisition_id == acquisition_id, StoredFile.state == "accepted"

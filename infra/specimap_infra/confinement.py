@@ -1,4 +1,4 @@
-"""What is said at the start about the confinement of processes that read uploaded files."""
+"""Check at the start that processes which read uploaded files are confined."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from specimap_infra.settings import ServiceSettings
 
 
 def check_confinement(settings: ServiceSettings) -> None:
-    """Warn where such processes could reach more than their files.
+    """Warn if such processes could reach more than their files.
 
     Raises:
-        SettingsError: the settings require that they cannot.
+        SettingsError: they could, and the settings require that they cannot.
     """
     found = protection()
     if settings.sandbox == "off":

@@ -19,7 +19,7 @@ CONNECT_SECONDS = 5
 
 
 def make_engine(url: str, *, pool_size: int = 10) -> sa.Engine:
-    """An engine for the SQLAlchemy URL, set up so that writers queue and a dead server is noticed."""
+    """Make an engine for the SQLAlchemy URL, on which writers queue and a dead server is noticed."""
     parsed = sa.make_url(url)
     if parsed.get_backend_name() == "sqlite":
         if parsed.database:
@@ -42,7 +42,7 @@ def make_engine(url: str, *, pool_size: int = 10) -> sa.Engine:
         max_overflow=20,
         pool_timeout=CONNECT_SECONDS,
         pool_pre_ping=True,
-        # A server that vanished without a word is given up after ten seconds.
+        # A server that no longer answers is given up after ten seconds.
         connect_args={"connect_timeout": CONNECT_SECONDS, "tcp_user_timeout": 10_000},
     )
 
@@ -61,7 +61,7 @@ class Database:
 
     @contextmanager
     def session(self) -> Iterator[Session]:
-        """A transaction: committed at the end of the block, rolled back where it raises.
+        """Open a transaction: committed at the end of the block, rolled back if it raises.
 
         Raises:
             DatabaseUnavailableError: the server cannot be reached.
@@ -70,7 +70,7 @@ class Database:
             yield session
 
     def check(self) -> None:
-        """Raise DatabaseUnavailableError where it does not answer."""
+        """Raise DatabaseUnavailableError if the database does not answer."""
         with self.session() as session:
             session.execute(sa.text("SELECT 1"))
 
@@ -81,7 +81,7 @@ class Database:
 
 @contextmanager
 def database_errors() -> Iterator[None]:
-    """Turn lost connections into one typed error; other errors pass."""
+    """Turn lost connections into DatabaseUnavailableError; let other errors pass."""
     try:
         yield
     except (OperationalError, sa.exc.TimeoutError) as error:
@@ -100,12 +100,12 @@ def _unavailable(error: Exception) -> DatabaseUnavailableError:
 
 
 def database_seconds(engine: sa.Engine) -> sa.ColumnElement[float]:
-    """Now in seconds by the database's clock, which all machines share."""
+    """Return the current time in seconds by the database's clock, which all machines share."""
     if engine.dialect.name == "sqlite":
         return sa.literal_column("((julianday('now') - 2440587.5) * 86400.0)", sa.Float())
     return sa.literal_column("extract(epoch from clock_timestamp())::double precision", sa.Float())
 
 
 def utc_now() -> datetime.datetime:
-    """Now, with the time zone."""
+    """Return the current time in UTC, with its time zone."""
     return datetime.datetime.now(datetime.UTC)

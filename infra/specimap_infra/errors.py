@@ -6,19 +6,19 @@ from specimap_core.errors import SpecimapError
 
 
 class JobConflictError(SpecimapError, ValueError):
-    """The job's or acquisition's state does not allow what was asked."""
+    """The state of the job or acquisition does not allow the request."""
 
     code = "state_conflict"
 
 
 class LostLeaseError(SpecimapError, RuntimeError):
-    """A worker wrote to a job that is not its own any more: cancelled, ended, or taken over by another."""
+    """A worker wrote to a job that is no longer its own: cancelled, ended, or taken over by another."""
 
     code = "lost_lease"
 
 
 class WorkerCrashedError(SpecimapError, RuntimeError):
-    """The job's process died again and again; ``details['stage']`` says where."""
+    """The job's process died at every start; ``details['stage']`` names the stage."""
 
     code = "worker_crashed"
 

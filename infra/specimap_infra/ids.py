@@ -1,4 +1,4 @@
-"""Identifiers: sortable by time, safe in paths and URLs, and telling nothing about a patient."""
+"""Identifiers: sortable by time, safe in paths and URLs, without any information about a patient."""
 
 from __future__ import annotations
 
@@ -12,5 +12,5 @@ PATTERN = re.compile(r"^[a-z]{2,5}_[0-9a-hjkmnp-tv-z]{26}$")
 
 
 def new_id(kind: Kind) -> str:
-    """``job_01k…``: a kind and a ULID in lower case."""
+    """Make an identifier, ``job_01k…``: a kind and a ULID in lower case."""
     return f"{kind}_{str(ULID()).lower()}"

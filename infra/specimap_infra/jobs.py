@@ -1,8 +1,8 @@
-"""Jobs' rows and their events: the only place that changes them, for the API and the workers alike.
+"""Changes to jobs' rows and their events, all of them, by the API and the workers.
 
-Every function runs within the caller's transaction, first locks the job's row, and writes an event beside each change,
-so that whoever reads the events misses nothing. Workers write through a fence: a job belongs to the executor that
-claimed it last, and a write by another, or after the end, changes nothing and raises LostLeaseError.
+Every function runs within the caller's transaction, first locks the job's row, and writes an event with each change,
+so that a reader of the events misses none. Writes of workers are fenced: a job belongs to the executor that claimed it
+last, and a write by another, or after the end, changes nothing and raises LostLeaseError.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Stage = Literal["reconstruct", "adjust", "render", "register"]
 EventType = Literal["state", "progress", "log"]
 Level = Literal["debug", "info", "warning", "error"]
 Failure = SpecimapError | dict[str, Any]
-"""An error, or what its ``as_dict`` gave in another process."""
+"""An error, or its ``as_dict`` from another process."""
 
 FOLLOWING: dict[str, frozenset[str]] = {
     "queued": frozenset({"running", "failed", "cancelled"}),
@@ -43,9 +43,9 @@ FOLLOWING: dict[str, frozenset[str]] = {
 
 
 def claim(session: Session, job_id: str, executor: str) -> Job | None:
-    """Take a job: it runs, and belongs to ``executor`` from now on, whoever held it before.
+    """Claim a job: it runs, and belongs to ``executor`` from now on, even if another one held it before.
 
-    Returns: the job, its starts counted; None where it is gone or has ended (cancelled while it waited).
+    Returns: the job, with this start counted; None if it was deleted or has ended (cancelled while it waited).
     """
     job = locked(session, job_id)
     if job is None or job.state in FINAL_STATES:
@@ -57,7 +57,7 @@ def claim(session: Session, job_id: str, executor: str) -> Job | None:
 
 
 def report_progress(session: Session, job_id: str, executor: str, stage: Stage, share: float) -> None:
-    """Say how far the running stage is, 0 to 1.
+    """Record the progress of the running stage, 0 to 1.
 
     Raises:
         LostLeaseError: the job is not this executor's.
@@ -97,9 +97,9 @@ def finish(
 
 
 def release(session: Session, job_id: str) -> Job | None:
-    """Put a dead worker's job back in the queue, for another to claim. No fence: only for whoever judges leases.
+    """Put a dead worker's job back into the queue for another to claim. Not fenced: only for the check of leases.
 
-    Returns: the job; None where it is gone or has ended.
+    Returns: the job; None if it was deleted or has ended.
     """
     job = locked(session, job_id)
     if job is None or job.state in FINAL_STATES:
@@ -110,9 +110,9 @@ def release(session: Session, job_id: str) -> Job | None:
 
 
 def fail_orphan(session: Session, job_id: str, error: Failure) -> Job | None:
-    """Fail a job that no worker can finish. No fence: only for whoever judges leases.
+    """Fail a job that no worker can finish. Not fenced: only for the check of leases.
 
-    Returns: the job; None where it is gone or had ended before.
+    Returns: the job; None if it was deleted or has ended.
     """
     job = locked(session, job_id)
     if job is None or job.state in FINAL_STATES:
@@ -127,13 +127,13 @@ def fail_orphan(session: Session, job_id: str, error: Failure) -> Job | None:
 def request_cancel(session: Session, job_id: str) -> Job:
     """Cancel a job: its row at once; the caller cancels the engine's workflow after the commit.
 
-    A worker that still runs it learns from its next write. Cancelling twice is no error.
+    A worker that still runs it learns of it at its next write. Cancelling twice is not an error.
 
     Raises:
         NotFoundError: there is no such job.
         JobConflictError: it has succeeded or failed.
     """
-    job = _known(session, job_id)
+    job = _found(session, job_id)
     if job.state != "cancelled":
         _change(session, job, "cancelled")
     return job
@@ -148,15 +148,15 @@ def set_state(
     """Change a job's state, with an event, and a delivery where it ends and has a webhook.
 
     Args:
-        executor: who runs or ran it; a job that ends keeps its last executor's name.
-        error: why it failed.
+        executor: the worker that runs or ran it; a job that ends keeps its last executor's name.
+        error: the reason for its failure.
 
     Raises:
         NotFoundError: there is no such job.
         JobConflictError: the state cannot follow the present one; details name both.
         LostLeaseError: ``executor`` ends a job that is another's.
     """
-    _change(session, _known(session, job_id), state, executor=executor, error=error)
+    _change(session, _found(session, job_id), state, executor=executor, error=error)
 
 
 def append_event(session: Session, job_id: str, type: EventType, data: dict[str, Any]) -> int:
@@ -167,12 +167,12 @@ def append_event(session: Session, job_id: str, type: EventType, data: dict[str,
     Raises:
         NotFoundError: there is no such job.
     """
-    return _append(session, _known(session, job_id), type, data)
+    return _append(session, _found(session, job_id), type, data)
 
 
 def locked(session: Session, job_id: str) -> Job | None:
-    """The job as it is now; nobody else changes it until the transaction ends. None where there is none."""
-    # Changes that this transaction has not sent yet would be overwritten by what is read.
+    """Lock the job until the transaction ends, and return it as it is now; None if there is none."""
+    # Reading would overwrite changes that this transaction has not sent yet.
     session.flush()
     if session.get_bind().dialect.name == "sqlite":
         # A read takes no lock there, a write takes the only one.
@@ -205,7 +205,7 @@ def _change(
         if job.webhook is not None:
             session.add(Delivery(id=new_id("dlv"), job_id=job.id, state="pending"))
     else:
-        # The stage stays: where worker after worker dies, it says in which.
+        # The stage stays: it shows in which one workers die, if they do.
         job.executor, job.progress = executor, 0.0
         event["starts"] = job.starts
     job.state = state
@@ -220,7 +220,7 @@ def _append(session: Session, job: Job, type: EventType, data: dict[str, Any]) -
     return last + 1
 
 
-def _known(session: Session, job_id: str) -> Job:
+def _found(session: Session, job_id: str) -> Job:
     job = locked(session, job_id)
     if job is None:
         raise NotFoundError(f"There is no job {job_id}.", advice="Check the id; it may have been deleted.")
@@ -228,10 +228,10 @@ def _known(session: Session, job_id: str) -> Job:
 
 
 def held(session: Session, job_id: str, executor: str) -> Job:
-    """The locked job, if it runs and is this executor's.
+    """Return the locked job, if it runs and is this executor's.
 
     Raises:
-        LostLeaseError: it is not.
+        LostLeaseError: it does not run, or is another's.
     """
     job = locked(session, job_id)
     if job is None or job.executor != executor or job.state != "running":

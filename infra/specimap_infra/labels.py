@@ -1,4 +1,4 @@
-"""Which label layers a cloud has: the highest version of each name is the current one."""
+"""Label layers of a cloud: the highest version of each name is the current one."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from specimap_infra.tables import CloudRow, LabelVersion
 
 
 def lock_cloud(session: Session, cloud_id: str) -> None:
-    """Keep others from changing what hangs on a cloud until the transaction ends.
+    """Lock a cloud with its labels and exports until the transaction ends.
 
     Raises:
         NotFoundError: there is no such cloud.
     """
     # A write that changes nothing, since SQLite locks by writes only.
-    held = session.execute(
+    row = session.execute(
         sa.update(CloudRow).where(CloudRow.id == cloud_id).values(points=CloudRow.points).returning(CloudRow.id),
         execution_options={"synchronize_session": False},
     )
-    if held.first() is None:
+    if row.first() is None:
         raise NotFoundError(f"There is no cloud {cloud_id}.", advice="GET /v1/clouds lists all.")
 
 
 def current_labels(session: Session, cloud_id: str) -> list[LabelVersion]:
-    """The current version of each layer, by name."""
+    """List the current version of each layer, by name."""
     other = aliased(LabelVersion)
     newest = (
         sa.select(sa.func.max(other.version))
@@ -40,6 +40,6 @@ def current_labels(session: Session, cloud_id: str) -> list[LabelVersion]:
 
 
 def fingerprint(labels: Iterable[LabelVersion]) -> str:
-    """A hash that changes whenever a layer comes, goes or gets another version."""
+    """Return a hash that changes whenever a layer is added, removed or gets another version."""
     named = sorted(f"{row.name}={row.storage_prefix}" for row in labels)
     return hashlib.sha256("\n".join(named).encode()).hexdigest()

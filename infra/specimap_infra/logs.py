@@ -1,4 +1,4 @@
-"""Structured logs: one JSON object a line, with the correlation id and pseudonymous ids that are bound to it."""
+"""Structured logs: one JSON object in each line, with the correlation id and the pseudonymous ids bound to it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def set_up_logs(settings: ServiceSettings) -> None:
     level = getattr(logging, settings.log_level.upper())
     if settings.log_format == "json":
         tail: list[structlog.typing.Processor] = [
-            # Without local variables: among them are keys and names that came with uploads.
+            # Without local variables: keys and uploaded names are among them.
             structlog.processors.ExceptionRenderer(ExceptionDictTransformer(show_locals=False)),
             structlog.processors.JSONRenderer(serializer=json_log_line),
         ]
@@ -50,11 +50,11 @@ def set_up_logs(settings: ServiceSettings) -> None:
         logger = logging.getLogger(name)
         logger.handlers[:] = []
         logger.propagate = True
-    # The access log is the service's own; the libraries' routine lines tell a person nothing.
+    # The service writes its own access log; the libraries' routine lines are of no use.
     for name in ("uvicorn.access", "dbos", "alembic", "tuspyserver", "httpx", "httpcore"):
         logging.getLogger(name).setLevel(max(level, logging.WARNING))
 
 
 def logger() -> structlog.stdlib.BoundLogger:
-    """A logger; bind ids to it, never names that came with uploads."""
+    """Return a logger; bind ids to it, never uploaded names."""
     return structlog.stdlib.get_logger("specimap")

@@ -15,11 +15,11 @@ from dbos import DBOS
 from specimap_infra.database import Database, database_errors
 
 LOCK = 7261534
-"""Number of the PostgreSQL advisory lock; any that nothing else in the database uses."""
+"""Number of the PostgreSQL advisory lock; any number that nothing else in the database uses."""
 
 
 def alembic_config(connection: sa.Connection | None = None) -> Config:
-    """Alembic's configuration, without a file."""
+    """Make Alembic's configuration, without a file."""
     config = Config()
     config.set_main_option("script_location", "specimap_infra:migrations")
     config.attributes["connection"] = connection
@@ -32,7 +32,7 @@ def migrate(database: Database) -> None:
     Raises:
         DatabaseUnavailableError: the server cannot be reached.
     """
-    with database_errors(), alone(database.engine):
+    with database_errors(), exclusive_lock(database.engine):
         # The engine's own function, since its client never migrates.
         DBOS.migrate(database.engine.url.render_as_string(hide_password=False))
         with database.engine.begin() as connection:
@@ -40,8 +40,8 @@ def migrate(database: Database) -> None:
 
 
 @contextmanager
-def alone(engine: sa.Engine) -> Iterator[None]:
-    """Let no other program do what is done here at the same time."""
+def exclusive_lock(engine: sa.Engine) -> Iterator[None]:
+    """Hold a lock on the database that only one program can hold at a time."""
     if engine.dialect.name == "sqlite":
         file = engine.url.database
         if not file:

@@ -1,4 +1,4 @@
-"""The job queue's names and its client: DBOS, durable workflows in the same database as the tables."""
+"""Job queue: its names and its client. DBOS keeps durable workflows in the same database as the tables."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ MAKE_EXPORT = "make_export"
 """Workflow with one argument, the export's id, which is also the workflow's."""
 APPLICATION = "specimap"
 APPLICATION_VERSION = "1"
-"""Fixed: by default it is a hash of the code, and a new version would never take up an old one's jobs."""
+"""Fixed: by default it is a hash of the code, and a new version would never run the jobs of an old one."""
 POLL_SECONDS = 0.25
 
 
 def queue_client(engine: sa.Engine) -> DBOSClient:
-    """A client that enqueues and cancels; it runs nothing."""
+    """Make a client that enqueues and cancels; it runs nothing."""
     return DBOSClient(
         system_database_engine=engine,
         serializer=JsonSerializer(),
@@ -31,7 +31,7 @@ def queue_client(engine: sa.Engine) -> DBOSClient:
 
 
 def enqueue(client: DBOSClient, connection: sa.Connection, queue: str, workflow: str, id: str, priority: int) -> None:
-    """Enqueue within the caller's transaction, so that a row and its workflow are there together or not at all."""
+    """Enqueue within the caller's transaction, so that a row and its workflow exist together or not at all."""
     client.enqueue_in_transaction(
         connection,
         {

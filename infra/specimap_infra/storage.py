@@ -1,14 +1,13 @@
-"""Where files lie that several processes share: a folder, or a bucket of an S3-compatible store.
+"""Storage of files that several processes share: a folder, or a bucket of an S3-compatible store.
 
 Keys are paths of safe names made by the program (``jobs/job_…/register/att_…/cloud.zarr/zarr.json``); names that a
-person gave never become part of one. Files appear whole; a folder's files are referred to only once all are there.
+person gave never become part of one. Files appear whole; a folder's files are referred to only once all are stored.
 """
 
 from __future__ import annotations
 
 import datetime
 import os
-import re
 import shutil
 import uuid
 from collections.abc import Iterator
@@ -21,15 +20,14 @@ import obstore
 from obstore.store import LocalStore, S3Store
 
 from specimap_core.atomic import disk_errors, remove
-from specimap_core.errors import NotFoundError, OutputNotWritableError, SettingsError, StorageFullError
-from specimap_infra.errors import StorageUnavailableError
+from specimap_core.errors import SettingsError, StorageFullError
 from specimap_infra.logs import logger
 from specimap_infra.settings import ServiceSettings
+from specimap_infra.storage_errors import checked, not_found, store_errors
 
-PART = re.compile(r"^[A-Za-z0-9_=-][A-Za-z0-9._=-]*$")
 CHUNK = 1024 * 1024
 TEMPORARY = "tmp"
-"""Folder in a local storage for what is being written; what killed writers left there may be removed after a day."""
+"""Folder in a local storage for files being written; those that killed writers left may be removed after a day."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,7 @@ class Storage:
         """
         place = settings.storage_place
         with disk_errors(settings.scratch):
-            # Each by itself: the folders above one that is made with its parents get the usual rights.
+            # One after the other, since missing parent folders are made with the usual rights.
             for private in (settings.data_dir, settings.scratch):
                 private.mkdir(parents=True, exist_ok=True, mode=0o700)
         if not place.startswith("s3://"):
@@ -92,27 +90,27 @@ class Storage:
     # ---- reading --------------------------------------------------------------------------------------
 
     def path(self, key: str) -> Path | None:
-        """The file or folder itself, where the storage is a folder; it need not exist."""
+        """Return the file or folder itself, where the storage is a folder; it need not exist."""
         return None if self.folder is None else self.folder / checked(key)
 
     def stat(self, key: str) -> Stored:
-        """Size and ETag. Raises NotFoundError."""
-        with _store_errors(key):
+        """Return size and ETag. Raises NotFoundError."""
+        with store_errors(key):
             return _stored(obstore.head(self._store, checked(key)))
 
     def read(self, key: str, start: int = 0, stop: int | None = None) -> bytes:
-        """The file's bytes from ``start`` up to ``stop``. Raises NotFoundError."""
-        with _store_errors(key):
+        """Read the file's bytes from ``start`` up to ``stop``. Raises NotFoundError."""
+        with store_errors(key):
             if start == 0 and stop is None:
                 return bytes(obstore.get(self._store, checked(key)).bytes())
             end = self.stat(key).size if stop is None else stop
             return bytes(obstore.get_range(self._store, checked(key), start=start, end=end)) if end > start else b""
 
     def stream(self, key: str, start: int = 0, stop: int | None = None) -> Iterator[bytes]:
-        """The same piece by piece. Raises NotFoundError before the first piece."""
+        """Read as :meth:`read` does, piece by piece. Raises NotFoundError before the first piece."""
         local = self.path(key)
         if local is not None:
-            with _store_errors(key), open(local, "rb") as file:
+            with store_errors(key), open(local, "rb") as file:
                 file.seek(start)
                 left = (stop if stop is not None else os.fstat(file.fileno()).st_size) - start
                 while left > 0 and (piece := file.read(min(CHUNK, left))):
@@ -126,20 +124,20 @@ class Storage:
             yield piece
 
     def list(self, prefix: str) -> Iterator[Stored]:
-        """All files below a prefix."""
-        with _store_errors(prefix):
+        """List all files below a prefix."""
+        with store_errors(prefix):
             for batch in obstore.list(self._store, checked(prefix) + "/"):
                 yield from map(_stored, batch)
 
     def fetch(self, key: str, target: Path) -> None:
-        """Put a file, or all files below a prefix, at ``target``: by link where it can be, else by copy."""
+        """Link a file, or all files below a prefix, to ``target``; copy them where links are impossible."""
         local = self.path(key)
         with disk_errors(target):
             target.parent.mkdir(parents=True, exist_ok=True)
             if local is not None:
                 if not local.exists():
-                    raise _not_found(key)
-                # A link costs nothing and keeps the data for a running stage when the file is deleted meanwhile.
+                    raise not_found(key)
+                # A link is instant, and keeps the data for a running stage if the file is deleted meanwhile.
                 shutil.copytree(local, target, copy_function=_link) if local.is_dir() else _link(local, target)
                 return
             found = list(self.list(key))
@@ -163,13 +161,13 @@ class Storage:
 
     def put(self, key: str, data: bytes) -> None:
         """Write a file whole or not at all."""
-        with _store_errors(key):
+        with store_errors(key):
             obstore.put(self._store, checked(key), data)
 
     def put_file(self, key: str, source: Path) -> None:
         """Move a local file into the storage, whole or not at all; ``source`` is gone afterwards."""
         local = self.path(key)
-        with _store_errors(key):
+        with store_errors(key):
             if local is None:
                 obstore.put(self._store, checked(key), source, chunk_size=16 * CHUNK)
                 source.unlink()
@@ -192,10 +190,10 @@ class Storage:
 
     @contextmanager
     def publishing(self, prefix: str) -> Iterator[Path]:
-        """A local folder to fill; its files are stored below ``prefix`` when the block succeeds.
+        """Make a local folder to fill; its files are stored below ``prefix`` when the block succeeds.
 
-        In a folder they appear together, by one rename. In a bucket they come one by one: nothing may refer to the
-        prefix before the block has ended.
+        In a folder they appear together, by one rename. In a bucket they appear one by one: nothing may refer to
+        the prefix before the block has ended.
         """
         local = self.path(prefix)
         aside = self._aside(prefix.rsplit("/", 1)[-1]) if local else self._scratch / f"{uuid.uuid4().hex}.tmp"
@@ -203,7 +201,7 @@ class Storage:
             aside.mkdir(parents=True)
         try:
             yield aside
-            with _store_errors(prefix):
+            with store_errors(prefix):
                 if local is not None:
                     local.parent.mkdir(parents=True, exist_ok=True)
                     os.rename(aside, local)
@@ -217,10 +215,10 @@ class Storage:
     def delete(self, key: str) -> None:
         """Remove a file, or all files below a prefix; not an error where there is none."""
         local = self.path(key)
-        with _store_errors(key):
+        with store_errors(key):
             if local is not None:
                 if local.is_dir():
-                    # Out of sight at once, then file by file.
+                    # Hidden at once by a rename, then removed file by file.
                     aside = self._aside(local.name)
                     os.rename(local, aside)
                     remove(aside)
@@ -239,14 +237,14 @@ class Storage:
     # ---- state ----------------------------------------------------------------------------------------
 
     def free_bytes(self) -> int | None:
-        """Free space of the folder's disk; None for a bucket."""
+        """Return the free bytes of the folder's disk; None for a bucket."""
         if self.folder is None:
             return None
-        with _store_errors(str(self.folder)):
+        with store_errors(str(self.folder)):
             return shutil.disk_usage(self.folder).free
 
     def check_at_start(self) -> None:
-        """As :meth:`check`, but a full storage is warned of only: a service that starts can still be tidied up."""
+        """Check as :meth:`check` does, but only warn of a full storage: a running service lets users free space."""
         try:
             self.check()
         except StorageFullError:
@@ -257,18 +255,6 @@ class Storage:
         key = f"{TEMPORARY}/check-{uuid.uuid4().hex}"
         self.put(key, b"1")
         self.delete(key)
-
-
-def checked(key: str) -> str:
-    """The key, if it is made of safe names. Raises NotFoundError: no other key ever exists."""
-    parts = key.split("/")
-    if not all(PART.match(part) for part in parts):
-        raise _not_found(key)
-    return key
-
-
-def _not_found(key: str) -> NotFoundError:
-    return NotFoundError(f"There is no {key[:200]!r} in the storage.", advice="It may have been deleted.")
 
 
 def _stored(meta: obstore.ObjectMeta) -> Stored:
@@ -290,29 +276,3 @@ def _flush(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-@contextmanager
-def _store_errors(key: str) -> Iterator[None]:
-    try:
-        with disk_errors(Path(key)):
-            yield
-    except (StorageFullError, StorageUnavailableError, NotFoundError):
-        raise
-    except FileNotFoundError as error:
-        raise _not_found(key) from error
-    except OutputNotWritableError as error:
-        if isinstance(error.__cause__, FileNotFoundError | NotADirectoryError):
-            raise _not_found(key) from error
-        raise _unavailable(error) from error
-    except (obstore.exceptions.BaseError, OSError) as error:
-        if "No space left" in str(error) or "os error 28" in str(error):
-            raise StorageFullError("The storage is full.", advice="Free space; finished results are kept.") from error
-        raise _unavailable(error) from error
-
-
-def _unavailable(error: Exception) -> StorageUnavailableError:
-    # What the store says may name buckets and accounts: it goes to the log with the traceback.
-    return StorageUnavailableError(
-        f"The storage does not answer, or cannot be written ({type(error).__name__}).", advice="Try again later."
-    )

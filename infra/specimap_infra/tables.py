@@ -1,4 +1,4 @@
-"""The tables. Rows that hang on an acquisition or a job go with it."""
+"""Tables of the database. Rows that belong to an acquisition or a job are deleted with it."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class UtcDateTime(sa.types.TypeDecorator[datetime.datetime]):
     cache_ok = True
 
     def process_bind_param(self, value: datetime.datetime | None, dialect: sa.Dialect) -> datetime.datetime | None:
-        """Naive UTC for the database."""
+        """Convert to naive UTC for the database."""
         return None if value is None else value.astimezone(datetime.UTC).replace(tzinfo=None)
 
     def process_result_value(self, value: datetime.datetime | None, dialect: sa.Dialect) -> datetime.datetime | None:
-        """Aware UTC for the program."""
+        """Convert to aware UTC for the program."""
         return None if value is None else value.replace(tzinfo=datetime.UTC)
 
 
@@ -73,7 +73,7 @@ class ApiKey(Base):
 
 
 class Acquisition(Base):
-    """What was captured of one specimen."""
+    """An acquisition: the captures of one specimen."""
 
     __tablename__ = "acquisitions"
 
@@ -88,7 +88,7 @@ class Acquisition(Base):
 
 
 class StoredFile(Base):
-    """A file of an acquisition; ``label`` is the name that results speak of, ``name`` the one it came with."""
+    """A file of an acquisition; ``label`` is its name in results, ``name`` the client's own."""
 
     __tablename__ = "files"
     __table_args__ = (sa.UniqueConstraint("acquisition_id", "label"),)
@@ -102,14 +102,14 @@ class StoredFile(Base):
     sha256: Mapped[str]
     storage_key: Mapped[str]
     state: Mapped[str]
-    """``accepted``, or ``refused``: it takes no part in a job and is there to be retaken."""
+    """``accepted``, or ``refused``: no job uses it, and it should be retaken."""
     judgement: Mapped[dict[str, Any]]
     created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now)
     created_by: Mapped[str] = mapped_column(index=True)
 
 
 class Upload(Base):
-    """A resumable upload under way, or what became of it."""
+    """A resumable upload, under way or ended."""
 
     __tablename__ = "uploads"
 
@@ -119,7 +119,7 @@ class Upload(Base):
     name: Mapped[str]
     size: Mapped[int] = mapped_column(sa.BigInteger)
     state: Mapped[str]
-    """``open``, ``finished`` (``file_id`` says which file), ``failed`` (``error``), ``expired`` or ``terminated``."""
+    """``open``, ``finished`` (as file ``file_id``), ``failed`` (``error``), ``expired`` or ``terminated``."""
     file_id: Mapped[str | None]
     error: Mapped[dict[str, Any] | None]
     created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now)
@@ -145,7 +145,7 @@ class Job(Base):
     """Code, message, advice and details of the failure."""
     starts: Mapped[int] = mapped_column(default=0)
     executor: Mapped[str | None]
-    """Who may write to this row: a worker that lost its lease finds another's name here."""
+    """The worker that may write to this row: one that lost its lease finds another's name here."""
     idempotency_key: Mapped[str | None]
     request_hash: Mapped[str]
     correlation_id: Mapped[str]
@@ -159,7 +159,7 @@ class Job(Base):
 
 
 class JobEvent(Base):
-    """What happened to a job, in order: state, progress, log lines. ``seq`` is the event id that clients resume by."""
+    """An event of a job: state, progress or log line. Clients resume after the number ``seq``."""
 
     __tablename__ = "job_events"
 
@@ -172,7 +172,7 @@ class JobEvent(Base):
 
 
 class Artefact(Base):
-    """What a finished stage left: found again by the hash of all that went into it."""
+    """The result of a finished stage, found again by the hash of its inputs."""
 
     __tablename__ = "artefacts"
     __table_args__ = (sa.UniqueConstraint("acquisition_id", "stage", "key"),)
@@ -188,7 +188,7 @@ class Artefact(Base):
 
 
 class CloudRow(Base):
-    """A finished result: a folder ``prefix`` in the storage with cloud.zarr, mesh.ply, report.json and the rest."""
+    """A finished result: a folder ``prefix`` in the storage with cloud.zarr, mesh.ply, report.json and others."""
 
     __tablename__ = "clouds"
 
@@ -214,7 +214,7 @@ class LabelVersion(Base):
     kind: Mapped[str]
     """``class`` or ``probability``."""
     classes: Mapped[list[Any]]
-    """One object a class: value, name, colour."""
+    """One object for each class: value, name, colour."""
     made_by: Mapped[dict[str, Any]]
     storage_prefix: Mapped[str]
     sha256: Mapped[str]
@@ -232,20 +232,20 @@ class Export(Base):
     cloud_id: Mapped[str] = _owned_by("clouds")
     format: Mapped[str]
     state: Mapped[str]
-    """As of a job."""
+    """The same states as a job's."""
     storage_key: Mapped[str | None]
     size: Mapped[int | None] = mapped_column(sa.BigInteger)
     error: Mapped[dict[str, Any] | None]
     executor: Mapped[str | None]
     labels_hash: Mapped[str] = mapped_column(default="")
-    """Of the label layers in it, where it holds them: whether it is still what would be made now."""
+    """Hash of the label layers in it, if it holds any: shows whether it is still current."""
     correlation_id: Mapped[str]
     created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now)
     created_by: Mapped[str]
 
 
 class Delivery(Base):
-    """A webhook to be delivered, and how that went."""
+    """A webhook to be delivered, and the state of its delivery."""
 
     __tablename__ = "deliveries"
 
@@ -259,7 +259,7 @@ class Delivery(Base):
 
 
 class Lease(Base):
-    """A worker that says it is alive, in seconds of the database's clock."""
+    """The heartbeat of a worker, in seconds of the database's clock."""
 
     __tablename__ = "leases"
 
@@ -271,7 +271,7 @@ class Lease(Base):
 
 
 class AuditEntry(Base):
-    """Who did what to which thing. Never deleted with the thing."""
+    """An entry of the audit trail: which key did what to which object. It outlives the object."""
 
     __tablename__ = "audit"
 

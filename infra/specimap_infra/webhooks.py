@@ -1,4 +1,4 @@
-"""Webhooks: a signed POST when a job has ended, at least once; the id of the delivery tells repetitions."""
+"""Webhooks: a signed POST when a job has ended, at least once; the delivery's id identifies repetitions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SIGNATURE = "X-Specimap-Signature"
 DELIVERY = "X-Specimap-Delivery"
 TIMEOUT_SECONDS = 10.0
 CLAIM = datetime.timedelta(seconds=90)
-"""How long a delivery under way is nobody else's; one whose sender died is due again after it."""
+"""How long a delivery belongs to the worker that sends it; if that one died, it is due again afterwards."""
 LONGEST_WAIT_SECONDS = 900
 MOST_AT_ONCE = 50
 LARGEST_BODY = 256 * 1024
@@ -40,16 +40,16 @@ class _Claimed:
 
 
 def sign(secret: str, body: bytes, at: int) -> str:
-    """The signature's header: ``t=<unix seconds>,v1=<hex>``, HMAC-SHA256 of ``<t>.<body>``."""
+    """Make the signature's header: ``t=<unix seconds>,v1=<hex>``, HMAC-SHA256 of ``<t>.<body>``."""
     digest = hmac.new(secret.encode(), f"{at}.".encode() + body, hashlib.sha256).hexdigest()
     return f"t={at},v1={digest}"
 
 
 def check_target(url: str, settings: ServiceSettings) -> None:
-    """Refuse an address that no webhook may go to.
+    """Refuse an address to which no webhook may be sent.
 
     Raises:
-        SettingsError: it is no web address, carries a password, or its host is not in ``webhook_hosts``.
+        SettingsError: it is not a web address, carries a password, or its host is not in ``webhook_hosts``.
     """
     try:
         target = httpx.URL(url)
@@ -70,27 +70,27 @@ def _refused(message: str) -> SettingsError:
 
 
 def webhook_client() -> httpx.Client:
-    """A client that goes straight to the host and nowhere else: no proxy from the environment, no redirect."""
+    """Make a client that connects to the host itself only: no proxy from the environment, no redirect."""
     return httpx.Client(
         trust_env=False,
         follow_redirects=False,
         timeout=TIMEOUT_SECONDS,
-        # The system's certificates, which a hospital's own authority is among; httpx brings its own list.
+        # The system's certificates, which may include a hospital's own authority; httpx brings its own list.
         verify=ssl.create_default_context(),
         headers={"User-Agent": "specimap", "Content-Type": "application/json"},
     )
 
 
 def deliver_due(database: Database, settings: ServiceSettings, client: httpx.Client) -> int:
-    """Send what is due, one after the other; several workers may do so at once and share the work.
+    """Send the deliveries that are due, one after the other; workers that do so at once share them.
 
     Args:
-        client: as :func:`webhook_client` makes it.
+        client: made by :func:`webhook_client`.
 
     Returns: how many were attempted, at most 50.
 
     Raises:
-        DatabaseUnavailableError: the database went away; what was under way is due again after 90 s.
+        DatabaseUnavailableError: the database failed; the delivery under way is due again after 90 s.
     """
     now = utc_now()
     for done in range(MOST_AT_ONCE):
@@ -98,7 +98,7 @@ def deliver_due(database: Database, settings: ServiceSettings, client: httpx.Cli
         if claimed is None:
             return done
         status, delivered = _send(claimed, settings, client)
-        _note(database, settings, claimed, status, delivered)
+        _record_attempt(database, settings, claimed, status, delivered)
     return MOST_AT_ONCE
 
 
@@ -111,7 +111,7 @@ def _claim(database: Database, now: datetime.datetime) -> _Claimed | None:
             ).first()
             if row is None:
                 return None
-            # SQLite locks no row that is read: whoever changes it first has it.
+            # SQLite locks no row that is read: the first worker to change it has it.
             taken = session.execute(
                 sa.update(Delivery)
                 .where(Delivery.id == row.id, Delivery.attempts == row.attempts, due)
@@ -128,7 +128,7 @@ def _claim(database: Database, now: datetime.datetime) -> _Claimed | None:
 
 
 def _send(claimed: _Claimed, settings: ServiceSettings, client: httpx.Client) -> tuple[str, bool]:
-    """One attempt: what came of it in a word, and whether it was taken."""
+    """Attempt a delivery; return its status in a word, and whether the host accepted it."""
     try:
         check_target(claimed.url, settings)
     except SettingsError:
@@ -148,13 +148,15 @@ def _send(claimed: _Claimed, settings: ServiceSettings, client: httpx.Client) ->
         return type(error).__name__, False
 
 
-def _note(database: Database, settings: ServiceSettings, claimed: _Claimed, status: str, delivered: bool) -> None:
+def _record_attempt(
+    database: Database, settings: ServiceSettings, claimed: _Claimed, status: str, delivered: bool
+) -> None:
     last = claimed.attempt >= settings.webhook_attempts
     state = "delivered" if delivered else "given_up" if last else "pending"
     wait = datetime.timedelta(seconds=min(2.0**claimed.attempt, LONGEST_WAIT_SECONDS))
     with database.session() as session:
         session.execute(
-            # Where another has sent it meanwhile, its word counts.
+            # If another worker has sent it meanwhile, its result counts.
             sa.update(Delivery)
             .where(Delivery.id == claimed.id, Delivery.attempts == claimed.attempt, Delivery.state == "pending")
             .values(state=state, last_status=status, next_at=utc_now() + wait)

@@ -1,1 +1,1 @@
-"""The HTTP API: uploads, jobs, results, keys. Pulls no 3D vision package."""
+"""The HTTP API: uploads, jobs, results, keys. Imports no 3D vision package."""

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 
-from anyio import CapacityLimiter
 from fastapi import FastAPI
 from fastapi_offline import FastAPIOffline
 from starlette.middleware.cors import CORSMiddleware
@@ -13,29 +12,52 @@ from starlette.middleware.cors import CORSMiddleware
 from specimap_core import __version__
 from specimap_infra.settings import ServiceSettings
 from specimap_service import health, problems
+from specimap_service.acquisitions import dependencies as acquisitions
 from specimap_service.acquisitions import file_routes
 from specimap_service.acquisitions import routes as acquisition_routes
+from specimap_service.auth import dependencies as auth
 from specimap_service.auth import routes as key_routes
-from specimap_service.auth.keys import Keyring
+from specimap_service.body_limits import BodyLimits
+from specimap_service.clouds import dependencies as clouds
 from specimap_service.clouds import export_routes, label_routes, preview_routes, spectra_routes, zarr_routes
 from specimap_service.clouds import routes as cloud_routes
 from specimap_service.clouds.spectra import SpectraRequest
-from specimap_service.context import AppContext
+from specimap_service.context import CONTEXT, AppContext
+from specimap_service.jobs import dependencies as jobs
 from specimap_service.jobs import routes as job_routes
-from specimap_service.json_limit import Gate
-from specimap_service.middleware import Observed
-from specimap_service.uploads import form_routes
+from specimap_service.middleware import RequestObserver
+from specimap_service.uploads import dependencies as uploads
+from specimap_service.uploads import form_routes, tus_routes
 from specimap_service.uploads import routes as upload_routes
 
 DESCRIPTION = """\
 Photos and one hyperspectral cube of an excised specimen to a metric 3D point cloud in which every point carries its
 spectrum. Every call but `/healthz` and `/readyz` takes a key: `Authorization: Bearer spk_…`. Errors are
-`application/problem+json` with a stable code and an advice. Within `/v1` the contract only grows.
+`application/problem+json` with a stable code and advice. Within `/v1` the contract only grows.
 """
+
+FEATURES = (auth.FEATURE, acquisitions.FEATURE, uploads.FEATURE, jobs.FEATURE, clouds.FEATURE)
+"""Opened in this order, closed in the reverse one: uploads use the judge of acquisitions."""
+ROUTES = (
+    health,
+    key_routes,
+    acquisition_routes,
+    form_routes,
+    file_routes,
+    upload_routes,
+    job_routes,
+    cloud_routes,
+    zarr_routes,
+    spectra_routes,
+    preview_routes,
+    label_routes,
+    export_routes,
+)
+"""Modules with a ``router``, in the order of the API's description."""
 
 
 def create_app(settings: ServiceSettings) -> FastAPI:
-    """An app on the database and storage that the settings name; the database has been migrated.
+    """Create an app on the database and storage that the settings name; the database has been migrated.
 
     Raises:
         SettingsError, OutputNotWritableError: the storage or its folder cannot be made.
@@ -44,11 +66,13 @@ def create_app(settings: ServiceSettings) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        async with upload_routes.sweeping(app, context):
+        async with AsyncExitStack() as stack:
+            stack.callback(context.close)
+            for feature in FEATURES:
+                await stack.enter_async_context(feature.running(app))
             yield
-        context.close()
 
-    # Its pages bring their scripts along: nothing is fetched from elsewhere.
+    # The offline variant serves the scripts of its pages itself: nothing is fetched from elsewhere.
     app = FastAPIOffline(
         title="Specimap",
         version=__version__,
@@ -59,30 +83,17 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         lifespan=lifespan,
         separate_input_output_schemas=False,
     )
-    app.state.context = context
-    app.state.keyring = Keyring(context.database, settings.rate_per_minute, settings.quota_bytes)
-    app.state.parsing = CapacityLimiter(1)
-    problems.install(app)
-    problems.describe(app, read_apart=[SpectraRequest])
-    for module in (
-        health,
-        key_routes,
-        acquisition_routes,
-        form_routes,
-        file_routes,
-        upload_routes,
-        job_routes,
-        cloud_routes,
-        zarr_routes,
-        spectra_routes,
-        preview_routes,
-        label_routes,
-        export_routes,
-    ):
-        app.include_router(module.router)
-    # Within what answers browsers' questions and puts uploads right, before all that reads a body.
-    app.add_middleware(Gate)
-    upload_routes.mount(app, context)
+    CONTEXT.set(app, context)
+    for feature in FEATURES:
+        feature.open(app, context)
+    problems.add_handlers(app)
+    problems.describe(app, extra_models=[SpectraRequest])
+    for routes in ROUTES:
+        app.include_router(routes.router)
+    # The last one added sees a request first: the limits come after CORS and the corrections of uploads, and before
+    # everything that reads a body.
+    app.add_middleware(BodyLimits)
+    tus_routes.mount(app)
     if settings.cors_origins:
         app.add_middleware(
             CORSMiddleware,
@@ -92,7 +103,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
             expose_headers=EXPOSED,
             max_age=600,
         )
-    app.add_middleware(Observed, metrics=context.metrics)
+    app.add_middleware(RequestObserver, metrics=context.metrics)
     return app
 
 

@@ -21,26 +21,28 @@ ARROW = "application/vnd.apache.arrow.stream"
 NPY = "application/x-npy"
 OFFERED = (JSON, ARROW, NPY)
 BATCH = 4096
-"""Rows that are read, encoded and sent together: the most that is in memory of an answer at a time."""
+"""Rows that are read, encoded and sent together: the part of an answer that is in memory at a time."""
 _ARROW_END = b"\xff\xff\xff\xff\x00\x00\x00\x00"
 
 Columns = Mapping[str, Array]
 """Arrays (n,) or (n, m) by name, of one length."""
 
 
-def documented(model: Any) -> dict[int | str, dict[str, Any]]:
-    """``responses`` of an operation that answers in all three media types; ``model`` describes the JSON."""
+def documented_responses(model: Any) -> dict[int | str, dict[str, Any]]:
+    """Return ``responses`` of an operation that answers in all three media types; ``model`` describes the JSON."""
     binary = {"schema": {"type": "string", "format": "binary"}}
     return {200: {"model": model, "content": {ARROW: binary, NPY: binary}}}
 
 
 def chosen_type(request: Request, offered: Sequence[str] = OFFERED) -> str:
-    """The media type to answer with: the one preferred, the first offered among equals.
+    """Choose the media type of the answer: the one preferred, the first offered among equals.
 
     Raises:
         NotAcceptableError: none of them fits.
     """
-    accepted = [_weighed(part) for part in ",".join(request.headers.getlist("accept")).split(",") if part.strip()]
+    accepted = [
+        _media_and_weight(part) for part in ",".join(request.headers.getlist("accept")).split(",") if part.strip()
+    ]
     if not accepted:
         return offered[0]
     best = max(offered, key=lambda media: _quality(media, accepted))
@@ -51,7 +53,7 @@ def chosen_type(request: Request, offered: Sequence[str] = OFFERED) -> str:
     return best
 
 
-def _weighed(part: str) -> tuple[str, float]:
+def _media_and_weight(part: str) -> tuple[str, float]:
     media, *parameters = (item.strip().lower() for item in part.split(";"))
     weight = next((item[2:] for item in parameters if item.startswith("q=")), "1")
     try:
@@ -69,17 +71,17 @@ def _quality(media: str, accepted: list[tuple[str, float]]) -> float:
 
 
 def json_answer(content: Mapping[str, Any], headers: Mapping[str, str] | None = None) -> Response:
-    """JSON of plain values and arrays; what is not finite becomes null."""
+    """Answer with JSON of plain values and arrays; numbers that are not finite become null."""
     return Response(json_bytes(content), headers=headers, media_type=JSON)
 
 
 def json_bytes(content: Mapping[str, Any]) -> bytes:
-    """See :func:`json_answer`."""
+    """Encode as :func:`json_answer` does."""
     return orjson.dumps(content, default=_plain, option=orjson.OPT_SERIALIZE_NUMPY)
 
 
 def _plain(value: object) -> object:
-    # What the encoder cannot take itself: arrays that are not contiguous.
+    # The encoder itself takes no arrays that are not contiguous.
     if isinstance(value, np.ndarray):
         return np.ascontiguousarray(value) if not value.flags.c_contiguous else value.tolist()
     raise TypeError(f"{type(value).__name__} is no JSON")
@@ -91,10 +93,10 @@ def arrow_answer(
     metadata: Mapping[str, str],
     headers: Mapping[str, str] | None = None,
 ) -> Response:
-    """An Arrow IPC stream. ``read(start, stop)`` gives the columns of these rows; a column (n, m) becomes lists of m.
+    """Answer with an Arrow IPC stream. ``read(start, stop)`` gives the columns of these rows.
 
-    ``metadata`` goes into the schema. The first batch is read before the answer begins, so that what is wrong with it
-    is still told; the rest while it is sent.
+    A column (n, m) becomes lists of m. ``metadata`` goes into the schema. The first batch is read before the answer
+    begins, so that an error in it still reaches the client; the rest is read while the answer is sent.
     """
     first = _batch(read(0, min(BATCH, rows)))
     schema = first.schema.with_metadata(dict(metadata))
@@ -123,7 +125,10 @@ def _column(values: Array) -> pa.Array:
 def npy_answer(
     shape: tuple[int, ...], read: Callable[[int, int], Array], headers: Mapping[str, str] | None = None
 ) -> Response:
-    """A ``.npy`` file of little-endian float32; ``read(start, stop)`` gives rows of it. As :func:`arrow_answer`."""
+    """Answer with a ``.npy`` file of little-endian float32; ``read(start, stop)`` gives its rows.
+
+    It is read as in :func:`arrow_answer`.
+    """
     head = io.BytesIO()
     np.lib.format.write_array_header_1_0(head, {"descr": "<f4", "fortran_order": False, "shape": shape})
     rows = shape[0]

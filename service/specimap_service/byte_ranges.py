@@ -1,4 +1,4 @@
-"""Stored files over HTTP: whole or one byte range, with ETags (RFC 9110), in flat memory."""
+"""Stored files over HTTP: whole or one byte range, with ETags (RFC 9110), in constant memory."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ PIECE = 1024 * 1024
 """Bytes read at a time from a folder: two are in memory, one being sent and the next being read."""
 BUCKET_PIECE = 8 * PIECE
 CACHED = "private, max-age=300"
-"""For what never changes under its address: shorter than anyone waits for something deleted to be gone."""
+"""For content that never changes under its address; short, so that deleted content soon disappears from caches."""
 REVALIDATED = "private, no-cache"
-"""For what may change: kept by the client, but asked for by ETag every time."""
+"""For content that may change: the client keeps it, but checks its ETag every time."""
 _RANGE = re.compile(r"^bytes=\s*(\d{0,18})\s*-\s*(\d{0,18})\s*$")
 _TAG = re.compile(r'(?:W/)?"[^"]*"')
 
@@ -44,9 +44,9 @@ class _Source(Protocol):
 def ranged_response(
     request: Request, storage: Storage, key: str, media_type: str, filename: str | None = None, cache: str = CACHED
 ) -> Response:
-    """The answer to GET or HEAD of a stored file: 200, 206, 304, 412 or 416.
+    """Answer GET or HEAD of a stored file: 200, 206, 304, 412 or 416.
 
-    Call it from a ``def`` endpoint: it asks the storage. Several ranges at once, and what is no byte range, are
+    Call it from a ``def`` endpoint, since it blocks. Several ranges at once, and ranges that are not of bytes, are
     answered with the whole file, as HTTP allows. ``filename`` makes it a download of that name; ``cache`` is the
     answer's Cache-Control.
 
@@ -57,12 +57,12 @@ def ranged_response(
 
 
 def ranged_bytes(request: Request, content: bytes, media_type: str, cache: str = REVALIDATED) -> Response:
-    """The same for a document that was made rather than stored; its ETag is a hash."""
+    """Answer GET or HEAD of a document that was made rather than stored; its ETag is a hash."""
     return _answer(request, _InMemory(content), media_type, None, cache)
 
 
 def known_to_client(request: Request, etag: str) -> bool:
-    """Whether If-None-Match names the quoted ETag: then 304 says it all."""
+    """Return whether If-None-Match names the quoted ETag: the answer is then 304."""
     known = request.headers.get("if-none-match")
     return known is not None and _matches(known, etag, weakly=True)
 
@@ -104,7 +104,7 @@ def _answer(request: Request, source: _Source, media_type: str, filename: str | 
 
 
 class _Streamed(Response):
-    """Sends a range piece by piece; while one is sent, the next is read in a thread."""
+    """An answer that sends a range piece by piece; while one is sent, a thread reads the next."""
 
     def __init__(
         self, source: _Source, start: int, stop: int, status: int, headers: dict[str, str], media_type: str
@@ -113,7 +113,7 @@ class _Streamed(Response):
         self._source, self._start, self._stop = source, start, stop
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send; stops reading when the client has gone."""
+        """Send the range; stop reading when the client disconnects."""
         await send({"type": "http.response.start", "status": self.status_code, "headers": self.raw_headers})
         gone = asyncio.ensure_future(_disconnected(receive))
         ahead = self._read(self._start)
@@ -148,7 +148,7 @@ def _open(storage: Storage, key: str) -> _Source:
 
 
 class _InFolder:
-    """An open file: what is deleted or replaced meanwhile is still sent as it was."""
+    """An open file, sent as it was even if it is deleted or replaced meanwhile."""
 
     piece = PIECE
 
@@ -167,7 +167,7 @@ class _InFolder:
         self.etag = f"{found.st_ino:x}-{found.st_mtime_ns:x}-{found.st_size:x}"
 
     def read(self, start: int, stop: int) -> bytes:
-        """The bytes from ``start`` up to ``stop``."""
+        """Read the bytes from ``start`` up to ``stop``."""
         piece = os.pread(self._handle, stop - start, start)
         while len(piece) < stop - start:
             more = os.pread(self._handle, stop - start - len(piece), start + len(piece))
@@ -177,7 +177,7 @@ class _InFolder:
         return piece
 
     def __del__(self) -> None:
-        # When the last thread that reads from it lets go; a number closed earlier could be another file's by then.
+        # Not before the last reading thread has ended: the number of a closed file may be given to another one.
         if self._handle >= 0:
             os.close(self._handle)
 
@@ -191,7 +191,7 @@ class _InBucket:
         self.size, self.etag = found.size, found.etag
 
     def read(self, start: int, stop: int) -> bytes:
-        """The bytes from ``start`` up to ``stop``."""
+        """Read the bytes from ``start`` up to ``stop``."""
         return self._storage.read(self._key, start, stop)
 
 
@@ -203,7 +203,7 @@ class _InMemory:
         self.size, self.etag = len(content), hashlib.sha256(content).hexdigest()[:32]
 
     def read(self, start: int, stop: int) -> bytes:
-        """The bytes from ``start`` up to ``stop``."""
+        """Read the bytes from ``start`` up to ``stop``."""
         return self._content[start:stop]
 
 
@@ -220,7 +220,7 @@ def _matches(given: str, etag: str, *, weakly: bool) -> bool:
 
 
 def _parsed(given: str, size: int) -> tuple[int, int] | None:
-    """First byte and the one after the last; None where the header is to be ignored."""
+    """Return the first byte and the one after the last; None where the header is to be ignored."""
     found = _RANGE.match(given.strip())
     if found is None or found.group(1, 2) == ("", ""):
         return None

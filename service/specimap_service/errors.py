@@ -1,4 +1,4 @@
-"""Errors that only a request can meet."""
+"""Errors that only a request can cause."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class ForbiddenError(SpecimapError, PermissionError):
 
 
 class RateLimitedError(SpecimapError, RuntimeError):
-    """More requests than the key may make; ``details['retry_after_s']`` says when to come back."""
+    """More requests than the key may make; try again after ``details['retry_after_s']`` seconds."""
 
     code = "rate_limited"
 
@@ -48,19 +48,19 @@ class QuotaExceededError(SpecimapError, ValueError):
 
 
 class UploadIncompleteError(SpecimapError, ValueError):
-    """A job was asked for before all its files had arrived; details say what is missing."""
+    """A job was requested before all its files had arrived; details list what is missing."""
 
     code = "upload_incomplete"
 
 
 class UploadConflictError(SpecimapError, ValueError):
-    """The upload's offset, length or checksum is not what the client says."""
+    """The upload's offset, length or checksum differs from what the client sent."""
 
     code = "upload_conflict"
 
 
 class ChecksumMismatchError(SpecimapError, ValueError):
-    """What arrived does not have the checksum that came with it; nothing of it was kept."""
+    """The bytes that arrived do not have the checksum sent with them; none of them was kept."""
 
     code = "checksum_mismatch"
 
@@ -72,7 +72,7 @@ class UploadLockedError(SpecimapError, RuntimeError):
 
 
 class UploadGoneError(SpecimapError, FileNotFoundError):
-    """The upload expired or was ended; ``details['state']`` says which."""
+    """The upload expired or was terminated; ``details['state']`` says which."""
 
     code = "upload_gone"
 
@@ -84,7 +84,7 @@ class IdempotencyConflictError(SpecimapError, ValueError):
 
 
 class PreconditionFailedError(SpecimapError, ValueError):
-    """What is stored is not what the request's If-Match names."""
+    """The stored version is not the one that the request's If-Match names."""
 
     code = "precondition_failed"
 

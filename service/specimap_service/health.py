@@ -1,4 +1,4 @@
-"""``/healthz``: the process answers. ``/readyz``: it can also work. ``/metrics``: for Prometheus, with a key."""
+"""Health checks: ``/healthz`` (the process answers), ``/readyz`` (it can serve requests), ``/metrics`` (with a key)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 from specimap_core import __version__
 from specimap_infra.database import database_seconds
 from specimap_infra.tables import Lease
-from specimap_service.auth.keys import Admin
+from specimap_service.auth.dependencies import Admin
 from specimap_service.context import Context
 
 router = APIRouter(tags=["health"])
@@ -25,7 +25,7 @@ class Health(BaseModel):
 
 
 class Readiness(BaseModel):
-    """Database and storage answer; ``workers`` say they are alive."""
+    """Database and storage answer; ``workers`` counts those whose heartbeat is fresh."""
 
     status: Annotated[str, Field(examples=["ready"])]
     workers: int
@@ -33,13 +33,13 @@ class Readiness(BaseModel):
 
 @router.get("/healthz")
 async def healthz() -> Health:
-    """Whether the process answers; asks neither database nor storage."""
+    """Check that the process answers; neither database nor storage is asked."""
     return Health(status="ok", version=__version__)
 
 
 @router.get("/readyz")
 def readyz(context: Context) -> Readiness:
-    """Whether requests can be served: 503 with a code where the database or the storage does not answer."""
+    """Check that requests can be served: 503 with a code where the database or the storage does not answer."""
     with context.database.session() as session:
         oldest = database_seconds(context.database.engine) - context.settings.lease_seconds
         workers = session.scalar(sa.select(sa.func.count()).where(Lease.heartbeat >= oldest)) or 0
@@ -49,5 +49,5 @@ def readyz(context: Context) -> Readiness:
 
 @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
 def metrics(context: Context, principal: Admin) -> Response:
-    """Metrics in Prometheus' text format."""
+    """Return the metrics in Prometheus' text format."""
     return Response(context.metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")

@@ -66,7 +66,20 @@ HTTP_STATUS: dict[type[SpecimapError], int] = {
     service.UploadLockedError: 423,
 }
 
+_CLASSES: dict[int, type[SpecimapError]] = {
+    404: core.NotFoundError,
+    405: service.MethodNotAllowedError,
+    409: service.UploadConflictError,
+    413: service.PayloadTooLargeError,
+}
+"""The other way round, for statuses that the web framework and the tus library answer with themselves."""
+
 
 def status_of(error: SpecimapError) -> int:
-    """HTTP status of an error: its own, or that of the nearest class above it."""
+    """Return the HTTP status of an error: its own, or that of the nearest class above it."""
     return next(HTTP_STATUS[leaf] for leaf in type(error).__mro__ if leaf in HTTP_STATUS)
+
+
+def error_class(status: int) -> type[SpecimapError]:
+    """Return the error class for a status that the web framework or the tus library answered with."""
+    return _CLASSES.get(status, SpecimapError if status >= 500 else service.RequestInvalidError)

@@ -1,4 +1,4 @@
-"""Prometheus metrics, named ``specimap_<noun>_<verb>_<unit>``; what stands in the database is read when asked."""
+"""Prometheus metrics, named ``specimap_<noun>_<verb>_<unit>``; those from the database are read on request."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ class Metrics:
         self.registry.register(_FromDatabase(database, storage))
 
     def observe_request(self, method: str, route: str, status: int, seconds: float) -> None:
-        """Count one request; ``status`` 0 is a client that went away."""
+        """Count one request; ``status`` 0: the client disconnected."""
         self._requests.labels(method, route, str(status)).observe(seconds)
 
     def text(self) -> bytes:
-        """In Prometheus' text format."""
+        """Return the metrics in Prometheus' text format."""
         return generate_latest(self.registry)
 
 
@@ -50,11 +50,11 @@ class _FromDatabase(Collector):
         self._storage = storage
 
     def describe(self) -> list[GaugeMetricFamily]:
-        """Nothing, so that registering asks no database."""
+        """Describe nothing, so that registering does not query the database."""
         return []
 
     def collect(self) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
-        """Queue, jobs, stages, storage; nothing where the database is away."""
+        """Yield queue, jobs, stages and storage; nothing while the database is unavailable."""
         try:
             yield from self._jobs()
             yield from self._stored()

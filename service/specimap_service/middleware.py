@@ -1,4 +1,4 @@
-"""Plain ASGI middleware: a correlation id, an access log, metrics, and a last answer to unforeseen errors."""
+"""Plain ASGI middleware: correlation id, access log, metrics, and the answer to unforeseen errors."""
 
 from __future__ import annotations
 
@@ -19,8 +19,11 @@ ACCEPTED = re.compile(rb"^[A-Za-z0-9._-]{8,64}$")
 QUIET = ("/healthz", "/readyz", "/metrics")
 
 
-class Observed:
-    """Everything that is seen of a request from outside. No address, key or uploaded name is logged."""
+class RequestObserver:
+    """Middleware that gives each request a correlation id, logs and counts it, and answers unforeseen errors.
+
+    It logs no address, key or uploaded name.
+    """
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
         self._app = app

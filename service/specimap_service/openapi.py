@@ -1,4 +1,4 @@
-"""The contract as a document: ``python -m specimap_service.openapi > openapi.yaml``."""
+"""The API's description as a document: ``python -m specimap_service.openapi > openapi.yaml``."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ import yaml
 
 from specimap_infra.settings import ServiceSettings
 from specimap_service.app import create_app
+from specimap_service.context import CONTEXT
 
 
 def document() -> dict[str, Any]:
-    """What the app serves at ``/openapi.json``."""
+    """Return what the app serves at ``/openapi.json``."""
     with tempfile.TemporaryDirectory() as folder:
         app = create_app(ServiceSettings(data_dir=Path(folder), database_url="", storage="", scratch_dir=None))
         try:
             return app.openapi()
         finally:
-            app.state.context.close()
+            CONTEXT.of(app).close()
 
 
 def as_yaml(contract: dict[str, Any]) -> str:
-    """The document in YAML, in the order in which the app describes itself."""
+    """Write the document in YAML, in the order in which the app describes itself."""
     text: str = yaml.safe_dump(contract, sort_keys=False, allow_unicode=True, width=110)
     return text
 

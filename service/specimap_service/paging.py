@@ -16,14 +16,14 @@ After = Annotated[
 ]
 
 
-def _in_reach(value: datetime.datetime) -> datetime.datetime:
+def _year_in_range(value: datetime.datetime) -> datetime.datetime:
     if not 1900 <= value.year <= 9000:
         raise ValueError("a year from 1900 to 9000")
     return value
 
 
-Moment = Annotated[AwareDatetime, AfterValidator(_in_reach)]
-"""A time with its zone, not so near the calendar's ends that it has no UTC."""
+Moment = Annotated[AwareDatetime, AfterValidator(_year_in_range)]
+"""A time with its zone, far enough from the calendar's ends to have a UTC time."""
 
 
 class Page(BaseModel, Generic[Item]):
@@ -34,6 +34,6 @@ class Page(BaseModel, Generic[Item]):
 
 
 def page_of(found: list[Item], ids: list[str], limit: int) -> Page[Item]:
-    """A page from up to ``limit + 1`` items and their ids: one more than fits tells that there is a next page."""
+    """Make a page from up to ``limit + 1`` items and their ids: one more than fits means that there is a next page."""
     more = len(found) > limit
     return Page(items=found[:limit], next=ids[limit - 1] if more else None)

@@ -1,4 +1,4 @@
-"""Errors as problem+json (RFC 9457): code, what is wrong, what to do, and the correlation id to ask about."""
+"""Errors as problem+json (RFC 9457): code, message, advice, and the correlation id for questions."""
 
 from __future__ import annotations
 
@@ -12,24 +12,17 @@ from pydantic import BaseModel, ConfigDict, Field
 from pydantic.json_schema import models_json_schema
 from starlette.exceptions import HTTPException
 
-from specimap_core.errors import NotFoundError, SpecimapError
+from specimap_core.errors import SpecimapError
 from specimap_infra.logs import logger
 from specimap_service.context import correlation_id
-from specimap_service.errors import (
-    MethodNotAllowedError,
-    PayloadTooLargeError,
-    RateLimitedError,
-    RequestInvalidError,
-    UnauthorizedError,
-    UploadConflictError,
-)
-from specimap_service.http_status import status_of
+from specimap_service.errors import RateLimitedError, RequestInvalidError, UnauthorizedError
+from specimap_service.http_status import error_class, status_of
 
 MEDIA_TYPE = "application/problem+json"
 
 
 class Problem(BaseModel):
-    """What every error answer holds."""
+    """The body of every error answer."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -60,11 +53,11 @@ RESPONSES: dict[int | str, dict[str, Any]] = {
     "4XX": {"description": "Refused", "model": Problem, "content": {MEDIA_TYPE: {}}},
     "5XX": {"description": "Failed", "model": Problem, "content": {MEDIA_TYPE: {}}},
 }
-"""For each operation's documentation."""
+"""Error answers in each operation's documentation."""
 
 
 def problem_response(error: SpecimapError, status: int | None = None, **headers: str) -> JSONResponse:
-    """The answer to an error."""
+    """Make the answer to an error."""
     status = status or status_of(error)
     if isinstance(error, RateLimitedError):
         headers["Retry-After"] = str(error.details.get("retry_after_s", 1))
@@ -83,7 +76,7 @@ def problem_response(error: SpecimapError, status: int | None = None, **headers:
     return JSONResponse(body.model_dump(mode="json"), status, headers, MEDIA_TYPE)
 
 
-def install(app: FastAPI) -> None:
+def add_handlers(app: FastAPI) -> None:
     """Answer every error of the app with a problem."""
 
     @app.exception_handler(SpecimapError)
@@ -104,7 +97,7 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(HTTPException)
     async def _http(request: Request, error: HTTPException) -> JSONResponse:
-        leaf = _LEAVES.get(error.status_code, SpecimapError if error.status_code >= 500 else RequestInvalidError)
+        leaf = error_class(error.status_code)
         return problem_response(
             leaf(str(error.detail) + ".", advice="/docs shows what there is."),
             error.status_code,
@@ -112,35 +105,27 @@ def install(app: FastAPI) -> None:
         )
 
 
-def describe(app: FastAPI, read_apart: Sequence[type[BaseModel]] = ()) -> None:
-    """Leave out of the app's description what HTTP itself speaks of: a server answers a wrong one before the app.
+def describe(app: FastAPI, extra_models: Sequence[type[BaseModel]] = ()) -> None:
+    """Leave headers of HTTP itself out of the app's description: the server answers wrong ones before the app.
 
-    ``read_apart``: models of bodies that routes read themselves and only refer to.
+    ``extra_models``: models of bodies that routes read themselves and only refer to.
     """
-    described = app.openapi
-    _, more = models_json_schema(
-        [(model, "validation") for model in read_apart], ref_template="#/components/schemas/{model}"
+    original = app.openapi
+    _, extra = models_json_schema(
+        [(model, "validation") for model in extra_models], ref_template="#/components/schemas/{model}"
     )
 
     def openapi() -> dict[str, Any]:
-        contract = described()
+        contract = original()
         schemas = contract["components"]["schemas"]
-        contract["components"]["schemas"] = dict(sorted((schemas | more.get("$defs", {})).items()))
+        contract["components"]["schemas"] = dict(sorted((schemas | extra.get("$defs", {})).items()))
         for operations in contract["paths"].values():
             for operation in operations.values():
                 given = operation.get("parameters", [])
-                operation["parameters"] = [p for p in given if p["name"].lower() not in OF_HTTP]
+                operation["parameters"] = [p for p in given if p["name"].lower() not in HTTP_HEADERS]
         return contract
 
     app.openapi = openapi  # type: ignore[method-assign]
 
 
-OF_HTTP = ("content-length", "content-type")
-
-
-_LEAVES: dict[int, type[SpecimapError]] = {
-    404: NotFoundError,
-    405: MethodNotAllowedError,
-    409: UploadConflictError,
-    413: PayloadTooLargeError,
-}
+HTTP_HEADERS = ("content-length", "content-type")

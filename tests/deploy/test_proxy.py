@@ -278,7 +278,7 @@ def test_bodies_beyond_all_measure_reach_no_replica(proxy: Proxy, path: str, dig
 def test_limits_of_the_proxy_are_wider_than_those_of_the_api() -> None:
     """Where both refuse, the API says why."""
     from specimap_infra.settings import load_settings
-    from specimap_service.json_limit import LARGEST_JSON, LARGEST_SELECTION
+    from specimap_service.body_limits import LARGEST_JSON, LARGEST_SELECTION
 
     assert LARGEST_JSON < 10**6
     assert LARGEST_SELECTION < 10**7

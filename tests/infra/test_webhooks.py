@@ -194,7 +194,7 @@ def test_delivery_whose_sender_died_is_due_again(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(webhooks, "_note", dies)
+        patch.setattr(webhooks, "_record_attempt", dies)
         with pytest.raises(KeyboardInterrupt):
             deliver_due(sqlite_tables, settings(tmp_path), client)
     assert deliver_due(sqlite_tables, settings(tmp_path), client) == 0

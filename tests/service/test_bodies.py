@@ -12,8 +12,8 @@ from typing import Any
 import httpx
 import pytest
 
-from specimap_service.json_limit import FILES, LARGEST_JSON, LARGEST_SELECTION, SELECTIONS, most_bytes
-from specimap_service.uploads.multipart import LONGEST_HEADER, MOST_BESIDE, MOST_HEADERS
+from specimap_service.body_limits import FILES, LARGEST_JSON, LARGEST_SELECTION, SELECTIONS, most_bytes
+from specimap_service.uploads.multipart import LONGEST_HEADER, MOST_HEADERS, MOST_OVERHEAD
 from tests.support.places import SAMPLES
 from tests.support.service_scene import Running, serving
 from tests.support.upload_scene import client_at, key_in, new_acquisition, process_serving
@@ -227,9 +227,9 @@ FILE = b'Content-Disposition: form-data; name="file"; filename="x.jpg"\r\n\r\nno
         (form(ROLE, b"X-Long: " + b"x" * LONGEST_HEADER + b"\r\n" + FILE), 422),
         (form(ROLE, b"X" * LONGEST_HEADER + b"XX: y\r\n" + FILE), 422),
         (form(ROLE, b"X-Many: y\r\n" * (MOST_HEADERS + 1) + FILE), 422),
-        (form(ROLE, *[ROLE] * (MOST_BESIDE // 50), FILE), 413),
-        (b"x" * 2 * MOST_BESIDE, 422),
-        (form(ROLE, FILE) + b"x" * 2 * MOST_BESIDE, 413),
+        (form(ROLE, *[ROLE] * (MOST_OVERHEAD // 50), FILE), 413),
+        (b"x" * 2 * MOST_OVERHEAD, 422),
+        (form(ROLE, FILE) + b"x" * 2 * MOST_OVERHEAD, 413),
     ],
     ids=["good", "long header", "long name", "many headers", "many parts", "before", "after"],
 )
@@ -246,7 +246,7 @@ def test_forms_hold_little_beside_their_files(shared: Running, body: bytes, stat
 def test_a_large_file_needs_no_more_than_its_own_bytes(shared: Running) -> None:
     client = shared.client()
     data = (SAMPLES / "hsi" / "hsi.raw").read_bytes()
-    assert len(data) > 2 * MOST_BESIDE
+    assert len(data) > 2 * MOST_OVERHEAD
     answer = client.post(
         f"/v1/acquisitions/{new_acquisition(client)}/files", data={"role": "cube"}, files={"file": ("x.raw", data)}
     )

@@ -27,7 +27,7 @@ def result(service: Running, tmp_path: Path) -> Result:
 
 
 def open_clouds(service: Running) -> OpenClouds:
-    found: OpenClouds = service.app.state.context.clouds
+    found: OpenClouds = service.app.state.open_clouds
     return found
 
 

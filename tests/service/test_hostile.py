@@ -145,7 +145,7 @@ def test_confinement_holds_alone_where_a_reader_would_follow(kind: str, sandbox:
     secret = secrets_in(tmp_path / "elsewhere")[kind]
     data = HOSTILE[kind](str(secret), tmp_path)
     with serving(tmp_path / "service", sandbox=sandbox) as service:
-        judge: Judge = service.app.state.context.judge
+        judge: Judge = service.app.state.judge
         judge._command = (sys.executable, "-c", NAIVE, *judge._command[3:])
         file = uploaded(service, data, "x.tif" if kind == "ome" else "x.h5")
     # Without it the reader follows, which shows that the file is what it should be.

@@ -143,7 +143,7 @@ def test_many_listeners_cost_one_look_into_the_database(service: Running, monkey
     for seen in told:
         assert [(seq, type) for seq, type, _ in seen] == expected(20)
     assert len(looks) <= seconds / events.POLL_SECONDS + 4
-    feed: events.JobEvents = service.app.state.context.events
+    feed: events.JobEvents = service.app.state.job_events
     until(lambda: not feed._channels)
     until(lambda: feed._poller is not None and feed._poller.done())
     assert service.database.engine.pool.checkedout() == 0  # type: ignore[attr-defined]

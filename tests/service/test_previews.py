@@ -205,14 +205,14 @@ def test_probabilities_as_a_colour_scale(client: httpx.Client, result: Result) -
 
 def test_etag_spares_the_drawing(service: Running, client: httpx.Client, result: Result) -> None:
     first = client.get(previews(result, "band"), params={"b": "1"})
-    kept = service.app.state.context.pictures.kept_bytes
+    kept = service.app.state.pictures.kept_bytes
     assert kept == len(first.content)
     tag = first.headers["etag"]
     for given in (tag, f'"x", W/{tag}', "*"):
         known = client.get(previews(result, "band"), params={"b": "1"}, headers={"If-None-Match": given})
         assert (known.status_code, known.content, known.headers["etag"]) == (304, b"", tag)
     assert client.get(previews(result, "band"), params={"b": "1"}).content == first.content
-    assert service.app.state.context.pictures.kept_bytes == kept
+    assert service.app.state.pictures.kept_bytes == kept
     other = client.get(previews(result, "band"), params={"b": "2"}, headers={"If-None-Match": tag})
     assert other.status_code == 200
 

@@ -17,7 +17,7 @@ import pytest
 
 from specimap_infra.database import utc_now
 from specimap_infra.tables import Upload
-from specimap_service.uploads import lifecycle, tus_store
+from specimap_service.uploads import tus_store
 from tests.support.service_scene import Running
 from tests.support.upload_scene import (
     OCTETS,
@@ -127,7 +127,7 @@ def test_a_process_that_died_after_the_last_byte(service: Running, ask: str) -> 
     elif ask == "sweep":
         with service.database.session() as session:
             session.get_one(Upload, upload_id).expires_at = utc_now()
-        lifecycle.sweep(service.app.state.context, service.app.state.upload_files)
+        service.app.state.uploads.sweep()
     told = result(client, at)
     assert (told["state"], told["file"]["sha256"]) == ("finished", hashlib.sha256(PHOTO).hexdigest())
     (file,) = client.get(f"/v1/acquisitions/{acquisition}/files").json()

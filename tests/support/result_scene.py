@@ -164,7 +164,7 @@ def put_label(running: Running, result: Result, name: str, values: Array) -> Non
                 created_by="key_test",
             )
         )
-    running.app.state.context.clouds.forget(result.cloud_id)
+    running.app.state.open_clouds.forget(result.cloud_id)
 
 
 def mesh_of(cloud: Cloud) -> Mesh:

@@ -134,10 +134,10 @@ def test_an_interrupted_study_goes_on(small: OnDisk, tmp_path: Path, ran: list[t
             raise CancelledError("Stopped.")
 
     with pytest.raises(CancelledError):
-        study_subsampling(capture, out, SETTINGS, shares=(100, 80, 60), seeds=2, heard=stop)
+        study_subsampling(capture, out, SETTINGS, shares=(100, 80, 60), seeds=2, on_row=stop)
     assert len(ran) == 2
     assert len(Study.model_validate_json((out / FILE).read_text("utf-8")).rows) == 2
-    study = study_subsampling(capture, out, SETTINGS, shares=(100, 80, 60), seeds=2, heard=heard.append)
+    study = study_subsampling(capture, out, SETTINGS, shares=(100, 80, 60), seeds=2, on_row=heard.append)
     assert [(row.share, row.seed) for row in heard] == [(100, 1), (80, 1), (80, 2), (60, 1), (60, 2)]
     assert study.rows == heard
     assert [n for n, _ in ran] == [12, 10, 10, 7, 7]

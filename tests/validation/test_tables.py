@@ -15,7 +15,7 @@ from specimap_core.report import published
 from specimap_core.truth.judge import judge, judge_with_sigma
 from specimap_validation.capture import find_capture
 from specimap_validation.page_marks import check_marks, put
-from specimap_validation.photo_subsets import evenly, some
+from specimap_validation.photo_subsets import even_subset, random_subset
 from specimap_validation.runs import STAGE_SHARES, figures_of
 from specimap_validation.tables import Table
 from tests.support.scenes import Finished, OnDisk
@@ -62,12 +62,12 @@ def test_what_is_no_acquisition_is_refused(tmp_path: Path) -> None:
 
 def test_a_share_of_the_photos_is_spread_or_random_and_repeats() -> None:
     photos = [Path(f"{k:02d}.jpg") for k in range(24)]
-    assert evenly(photos, 0.5) == photos[1::2]
-    first = some(photos, 0.8, 1)
+    assert even_subset(photos, 0.5) == photos[1::2]
+    first = random_subset(photos, 0.8, 1)
     assert len(first) == len(set(first)) == 19
-    assert first == sorted(first) == some(photos, 0.8, 1)
-    assert first != some(photos, 0.8, 2)
-    assert some(photos, 1.0, 5) == photos
+    assert first == sorted(first) == random_subset(photos, 0.8, 1)
+    assert first != random_subset(photos, 0.8, 2)
+    assert random_subset(photos, 1.0, 5) == photos
 
 
 # ---- judging ------------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from specimap_validation.pages import markdown, publish_validation
 from specimap_validation.phantom import PhantomSettings
 from specimap_validation.runs import Outcome
 from specimap_validation.tables import VALIDATION_HEADINGS, validation_tables
-from specimap_validation.validation import AS_PUBLISHED, FILE, OURS, VARIANTS, Row, Validation, validate
+from specimap_validation.validation import AS_PUBLISHED, DEFAULT, FILE, VARIANTS, Row, Validation, validate
 from tests.support.scenes import OnDisk
 from tests.support.study_outcomes import REFUSED, outcome
 
@@ -72,7 +72,7 @@ def test_a_real_validation_of_one_phantom(tmp_path: Path, monkeypatch: pytest.Mo
     assert [(r.method, r.adjustment) for r in runs] == list(VARIANTS)
     assert {(r.defect, r.seed) for r in runs} == {("none", 4)}
     truths = {(r.method, r.adjustment): r.outcome.figures for r in runs}
-    ours, published = truths[OURS], truths[AS_PUBLISHED]
+    ours, published = truths[DEFAULT], truths[AS_PUBLISHED]
     assert ours is not None
     assert published is not None
     assert ours.truth is not None
@@ -140,7 +140,7 @@ def test_an_interrupted_validation_goes_on(tmp_path: Path, ran: Ran) -> None:
             raise CancelledError("Stopped.")
 
     with pytest.raises(CancelledError):
-        validate(phantoms(1, 2, 3), tmp_path, heard=stop)
+        validate(phantoms(1, 2, 3), tmp_path, on_row=stop)
     assert len(ran) == 8
     shares: list[float] = []
     found = validate(phantoms(1, 2, 3), tmp_path, progress=shares.append)

@@ -1,1 +1,1 @@
-"""What the figures rest on: runs judged against truth, subsampling studies, validation."""
+"""Evidence for the accuracy figures: runs judged against truth, subsampling studies, validation."""

@@ -1,4 +1,4 @@
-"""An acquisition as a folder: photos, a cube, and truth where there is some."""
+"""Acquisitions in a folder: photos, a cube, and truth where it is known."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _TRUTH = "truth.npz"
 
 @dataclass(frozen=True)
 class Capture:
-    """``folder`` with its ``photos``, its ``cube``, and whether truth lies beside them."""
+    """``folder`` with its ``photos`` and its ``cube``; ``has_truth``: whether it holds truth."""
 
     folder: Path
     photos: tuple[Path, ...]
@@ -24,12 +24,12 @@ class Capture:
 
     @property
     def name(self) -> str:
-        """What the folder is called."""
+        """The folder's name."""
         return self.folder.resolve().name
 
 
 def find_capture(folder: Path) -> Capture:
-    """Photos in ``rgb/`` or ``photos/``; the cube is the one header in ``hsi/`` or ``cube/``, else the file ``cube.*``.
+    """Find photos in ``rgb/`` or ``photos/``, and the cube: the one header in ``hsi/`` or ``cube/``, else ``cube.*``.
 
     Raises:
         NotFoundError: there is no such folder, or none for photos in it.

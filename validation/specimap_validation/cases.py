@@ -1,4 +1,4 @@
-"""What a validation runs on: phantoms with one defect each, and acquisitions with truth."""
+"""Cases of a validation: phantoms with one defect each, and acquisitions with truth."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from specimap_validation.phantom import PhantomSettings
 
 FULL = PhantomSettings(bands=16, wavelength_nm=(400.0, 1000.0))
 QUICK = replace(FULL, photos=16, photo_size=448, cube_rows=256, cube_cols=320, bands=8)
-"""Smaller photos, fewer of them, and a smaller cube: whether all works, not how well."""
+"""Fewer and smaller photos and a smaller cube: to check that everything works, not how well."""
 MOVED = "specimen moved"
-"""No registration by markers can make good for it; what counts is whether it is noticed."""
+"""A defect that no registration by markers can correct; the question is whether it is noticed."""
 QUICK_DEFECTS = ("none", "blur", "tilted cards", MOVED)
 SEEDS = (1, 2, 3)
 DEFECTS: dict[str, dict[str, Any]] = {
@@ -30,12 +30,12 @@ DEFECTS: dict[str, dict[str, Any]] = {
     "noisy cube": {"bad_band_fraction": 0.15, "dead_pixel_fraction": 0.01, "cube_noise": 0.02},
     "weak texture": {"texture_contrast": 0.2},
 }
-"""What is changed of a phantom, under the name that the tables show."""
+"""Changes to a phantom's settings, by the name that the tables show."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """An acquisition to be validated on: a phantom that is to be made of ``settings``, or a ``capture`` with truth."""
+    """An acquisition to validate on: a phantom to be made from ``settings``, or a ``capture`` with truth."""
 
     defect: str
     seed: int | None
@@ -44,7 +44,7 @@ class Case:
 
 
 def cases(seeds: tuple[int, ...], acquisitions: tuple[Path, ...], *, quick: bool) -> list[Case]:
-    """Each defect with each seed, then the acquisitions.
+    """List each defect with each seed, then the acquisitions.
 
     Raises:
         NotFoundError: an acquisition is not there, or holds no truth.

@@ -1,4 +1,4 @@
-"""Figures of studies and validations; the published values are drawn in."""
+"""Figures of studies and validations, with the published values."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_NAMES = {v.OURS: "camera, rigid (default)", v.AS_PUBLISHED: "homography, free (as published)"}
-_COLOURS = {v.OURS: BLUE, v.AS_PUBLISHED: VERMILION}
+_NAMES = {v.DEFAULT: "camera, rigid (default)", v.AS_PUBLISHED: "homography, free (as published)"}
+_COLOURS = {v.DEFAULT: BLUE, v.AS_PUBLISHED: VERMILION}
 _NORMAL = {1: 68.3, 2: 95.4}
 """Percent of a normal distribution within one and two standard deviations."""
 
@@ -27,7 +27,7 @@ _NORMAL = {1: 68.3, 2: 95.4}
 
 
 def study_2d(study: Study) -> Figure:
-    """2D corner error against the share of photos."""
+    """Draw the 2D corner error against the share of photos."""
     drawn = figure(height_in=3.4)
     ax = _share_axes(drawn, study, "2D corner error by share of the photos", "2D corner error, mm (mean of a run)")
     _series(ax, study, lambda f: f.corner_2d_mm.mean, BLUE, "o", "this method")
@@ -50,12 +50,12 @@ def study_2d(study: Study) -> Figure:
 
 
 def study_3d(study: Study) -> Figure:
-    """3D corner error against the share of photos, and the true error beside it where it is known."""
+    """Draw the 3D corner error against the share of photos, and the true error where it is known."""
     drawn = figure(height_in=4.2)
     ax = _share_axes(drawn, study, "3D error by share of the photos", "error, mm (logarithmic)")
     ax.set_yscale("log")
     ax.yaxis.set_major_formatter("{x:g}")
-    _series(ax, study, _deep, BLUE, "o", "3D corner error, median")
+    _series(ax, study, _corner_3d_median, BLUE, "o", "3D corner error, median")
     _series(ax, study, lambda f: f.truth.median_mm if f.truth else None, GREEN, "s", "true error, median")
     _series(ax, study, lambda f: f.truth.p95_mm if f.truth else None, GREEN, "^", "true error, 95th percentile")
     ax.plot(
@@ -108,7 +108,7 @@ def _share_axes(drawn: Figure, study: Study, title: str, y: str) -> Axes:
 def _series(
     ax: Axes, study: Study, value: Callable[[Figures], float | None], colour: str, marker: str, label: str
 ) -> None:
-    """A dot a run, and a line through the medians."""
+    """Draw a dot for each run, and a line through the medians."""
     known = [
         (row.share, number)
         for row in study.rows
@@ -122,7 +122,7 @@ def _series(
     ax.plot(shares, middles, color=colour, marker=marker, markersize=4.5, linewidth=1.4, label=label)
 
 
-def _deep(found: Figures) -> float | None:
+def _corner_3d_median(found: Figures) -> float | None:
     return None if found.corner_3d_mm is None else found.corner_3d_mm.median
 
 
@@ -130,7 +130,7 @@ def _deep(found: Figures) -> float | None:
 
 
 def validation_error(validation: v.Validation) -> Figure:
-    """True error of each acquisition: median and 95th percentile, by the default and by the published form."""
+    """Draw the true error of each acquisition: median and 95th percentile, by the default and by the published form."""
     names = _names(validation.rows)
     drawn = figure(height_in=1.7 + 0.34 * len(names))
     ax = styled(
@@ -142,45 +142,45 @@ def validation_error(validation: v.Validation) -> Figure:
             true = row.outcome.figures.truth if row.outcome.figures else None
             if true is None:
                 continue
-            y = names.index(row.defect) + (-0.15 if variant == v.OURS else 0.15) + 0.05 * ((row.seed or 2) - 2)
+            y = names.index(row.defect) + (-0.15 if variant == v.DEFAULT else 0.15) + 0.05 * ((row.seed or 2) - 2)
             ax.plot([true.median_mm, true.p95_mm], [y, y], color=colour, linewidth=1.2, alpha=0.6)
             ax.plot([true.median_mm], [y], "o", color=colour, markersize=4, label=label)
             label = None
     _logarithmic(ax)
-    _listed(ax, names)
+    _list_acquisitions(ax, names)
     _legend_below(drawn, ax)
     return drawn
 
 
 def validation_corners(validation: v.Validation) -> Figure:
-    """Corner errors of each acquisition beside the published ones."""
+    """Draw corner errors of each acquisition, and the published ones."""
     names = _names(validation.rows)
     drawn = figure(height_in=1.7 + 0.3 * len(names))
-    flat, deep = drawn.subplots(1, 2, sharey=True)
-    styled(flat, title="2D corner error", x="mm, mean of a run")
-    styled(deep, title="3D corner error", x="mm, median of a run")
+    ax_2d, ax_3d = drawn.subplots(1, 2, sharey=True)
+    styled(ax_2d, title="2D corner error", x="mm, mean of a run")
+    styled(ax_3d, title="3D corner error", x="mm, median of a run")
     for variant, colour in _COLOURS.items():
         label: str | None = _NAMES[variant]
         for row in _of(validation, variant):
             found = row.outcome.figures
             if found is None:
                 continue
-            y = names.index(row.defect) + (-0.12 if variant == v.OURS else 0.12)
-            flat.plot([found.corner_2d_mm.mean], [y], "o", color=colour, markersize=4, alpha=0.7, label=label)
+            y = names.index(row.defect) + (-0.12 if variant == v.DEFAULT else 0.12)
+            ax_2d.plot([found.corner_2d_mm.mean], [y], "o", color=colour, markersize=4, alpha=0.7, label=label)
             if found.corner_3d_mm is not None:
-                deep.plot([found.corner_3d_mm.median], [y], "o", color=colour, markersize=4, alpha=0.7)
+                ax_3d.plot([found.corner_3d_mm.median], [y], "o", color=colour, markersize=4, alpha=0.7)
             label = None
-    for ax, values in ((flat, [mean for mean, _ in published.CORNER_2D_MM]), (deep, published.CORNER_3D_MM)):
+    for ax, values in ((ax_2d, [mean for mean, _ in published.CORNER_2D_MM]), (ax_3d, published.CORNER_3D_MM)):
         for k, value in enumerate(values):
             ax.axvline(value, color=INK, linewidth=1, linestyle="--", label=published.REFERENCE if k == 0 else None)
         _logarithmic(ax)
-    _listed(flat, names)
-    _legend_below(drawn, flat)
+    _list_acquisitions(ax_2d, names)
+    _legend_below(drawn, ax_2d)
     return drawn
 
 
 def validation_sigma(validation: v.Validation) -> Figure:
-    """Share of the true errors within one and two stated standard deviations."""
+    """Draw the share of the true errors within one and two stated standard deviations."""
     names = _names(validation.rows)
     drawn = figure(height_in=1.7 + 0.3 * len(names))
     ax = styled(
@@ -191,7 +191,7 @@ def validation_sigma(validation: v.Validation) -> Figure:
     for sigmas, colour in ((1, BLUE), (2, GREEN)):
         ax.axvline(_NORMAL[sigmas], color=colour, linewidth=1, linestyle="--")
         label: str | None = f"within {sigmas} sigma (dashed: normal distribution, {_NORMAL[sigmas]:.0f} %)"
-        for row in _of(validation, v.OURS):
+        for row in _of(validation, v.DEFAULT):
             true = row.outcome.figures.truth if row.outcome.figures else None
             if true is None:
                 continue
@@ -199,24 +199,24 @@ def validation_sigma(validation: v.Validation) -> Figure:
             ax.plot([share], [names.index(row.defect)], "o", color=colour, markersize=4, alpha=0.7, label=label)
             label = None
     ax.set_xlim(-1, 101)
-    _listed(ax, names)
+    _list_acquisitions(ax, names)
     _legend_below(drawn, ax)
     return drawn
 
 
-def _listed(ax: Axes, names: list[str]) -> None:
-    """The acquisitions from top to bottom."""
+def _list_acquisitions(ax: Axes, names: list[str]) -> None:
+    """List the acquisitions from top to bottom."""
     ax.set_yticks(range(len(names)), names)
     ax.set_ylim(len(names) - 0.5, -0.5)
 
 
 def _logarithmic(ax: Axes) -> None:
-    """x logarithmic, in plain numbers."""
+    """Make the x axis logarithmic, labelled with plain numbers."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
     ax.set_xscale("log")
     low, high = ax.get_xlim()
-    # Within one decade a single number would stand alone.
+    # Within one decade the axis would show a single number.
     ax.xaxis.set_major_locator(LogLocator(subs=(1.0,) if high / low > 30 else (1.0, 2.0, 5.0)))
     ax.xaxis.set_major_formatter("{x:g}")
     ax.xaxis.set_minor_formatter(NullFormatter())

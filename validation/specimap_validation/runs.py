@@ -1,4 +1,4 @@
-"""One run of the pipeline, judged: what a study or a validation keeps of it."""
+"""Run the pipeline and judge the result; the outcome is kept by studies and validations."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ REFUSED = (
     RegistrationError,
     PhotoUnreadableError,
 )
-"""What photos or cube are refused for; anything else (a full disk, a stop) ends the whole study."""
+"""Errors that concern photos or cube of one run; others (a full disk, a stop) end the whole study."""
 STAGE_SHARES = {"reconstruct": 0.5, "adjust": 0.4, "render": 0.02, "register": 0.08}
 
 
@@ -57,7 +57,7 @@ class AgainstTruth(Section):
 
 
 class Figures(Section):
-    """What is kept of a run's report, with its errors against truth where there is truth."""
+    """Figures of a run's report, and its errors against truth where that is known."""
 
     photos_given: int
     photos_used: int
@@ -70,14 +70,14 @@ class Figures(Section):
 
 
 class Refusal(Section):
-    """Why a run was refused."""
+    """The reason why a run was refused."""
 
     code: str
     message: str
 
 
 class Outcome(Section):
-    """A run's figures, or why there are none."""
+    """A run's figures, or the reason why there are none."""
 
     figures: Figures | None
     refusal: Refusal | None
@@ -95,17 +95,17 @@ def run_and_judge(
     """Run into ``out`` and judge against the truth in the folder ``truth``; a refusal is an outcome, too.
 
     Raises:
-        SpecimapError: leaves that tell nothing of the acquisition, ``CancelledError`` among them.
+        SpecimapError: errors that do not concern the acquisition, ``CancelledError`` among them.
     """
     try:
-        report = run_pipeline(inputs, out, settings, progress=_as_one(progress), cancelled=cancelled)
+        report = run_pipeline(inputs, out, settings, progress=_stage_progress(progress), cancelled=cancelled)
     except REFUSED as error:
         return Outcome(figures=None, refusal=Refusal(code=error.code, message=error.message))
     return Outcome(figures=figures_of(report, out, truth), refusal=None)
 
 
 def figures_of(report: Report, out: Path, truth: Path | None) -> Figures:
-    """The figures of a finished run in ``out``."""
+    """Compute the figures of a finished run in ``out``."""
     left_out = report.leave_one_marker_out_mm
     return Figures(
         photos_given=report.photos.given,
@@ -115,11 +115,11 @@ def figures_of(report: Report, out: Path, truth: Path | None) -> Figures:
         leave_one_marker_out_mm=None if left_out is None else left_out.median,
         seconds=round(sum(report.seconds.values()), 2),
         warnings=[w.code for w in report.warnings],
-        truth=None if truth is None else _against(out, truth),
+        truth=None if truth is None else _judge_against(out, truth),
     )
 
 
-def _against(out: Path, truth: Path) -> AgainstTruth:
+def _judge_against(out: Path, truth: Path) -> AgainstTruth:
     judged = judge_with_sigma(out, truth)
     errors = judged.errors
     return AgainstTruth(
@@ -132,31 +132,31 @@ def _against(out: Path, truth: Path) -> AgainstTruth:
     )
 
 
-def _as_one(progress: Callable[[float], None]) -> Progress:
-    """Progress of a whole run from that of its stages."""
+def _stage_progress(progress: Callable[[float], None]) -> Progress:
+    """Turn progress of the whole run into progress of its stages."""
     names = list(STAGE_SHARES)
 
-    def heard(stage: str, share: float) -> None:
+    def report_stage(stage: str, share: float) -> None:
         before = sum(STAGE_SHARES[name] for name in names[: names.index(stage)])
         progress(before + STAGE_SHARES[stage] * share)
 
-    return heard
+    return report_stage
 
 
-def stopping(progress: Callable[[float], None], cancelled: Callable[[], bool]) -> Callable[[float], None]:
-    """Progress that stops what it tells of, by ``CancelledError``, where a stop was asked for."""
+def stoppable(progress: Callable[[float], None], cancelled: Callable[[], bool]) -> Callable[[float], None]:
+    """Wrap ``progress`` so that it raises CancelledError once a stop was requested."""
 
-    def told(share: float) -> None:
+    def report_or_stop(share: float) -> None:
         if cancelled():
             raise CancelledError("Stopped.", advice="Run again to go on from the last finished run.")
         progress(share)
 
-    return told
+    return report_or_stop
 
 
 @contextmanager
 def scratch_in(folder: Path) -> Iterator[Path]:
-    """A folder aside that is removed in the end; one that a killed run left goes at the next start."""
+    """Make a temporary folder, removed at the end; one that a killed run left is removed at the next start."""
     aside = folder / f".run.{uuid.uuid4().hex[:8]}.tmp"
     aside.mkdir()
     try:

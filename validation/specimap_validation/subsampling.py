@@ -1,4 +1,4 @@
-"""How few photos are enough: the pipeline on random shares of an acquisition's photos, each judged."""
+"""Subsampling study: the pipeline on random shares of an acquisition's photos, each run judged."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.progress import within
 from specimap_core.report.model import Section
 from specimap_validation.capture import Capture
-from specimap_validation.photo_subsets import some
+from specimap_validation.photo_subsets import random_subset
 from specimap_validation.runs import Outcome, run_and_judge, scratch_in
 
 SCHEMA_VERSION = 1
@@ -29,7 +29,7 @@ FILE = "subsampling.json"
 
 
 class Row(Section):
-    """One run: ``share`` of the photos in percent, the ``seed`` that chose them, how many were given."""
+    """One run: ``share`` of the photos in percent, the ``seed`` that chose them, their number ``photos``."""
 
     share: int
     seed: int
@@ -53,7 +53,7 @@ class Study(Section):
 
 
 def plan(shares: Sequence[int], seeds: int) -> list[tuple[int, int]]:
-    """(share, seed) of each run: all photos once, every other share with each seed.
+    """List (share, seed) of each run: all photos once, every other share with each seed.
 
     Raises:
         SettingsError: a share is not within 1 to 100 percent, or there is no seed.
@@ -74,25 +74,25 @@ def study_subsampling(
     shares: Sequence[int] = SHARES,
     seeds: int = SEEDS,
     progress: Callable[[float], None] = lambda share: None,
-    heard: Callable[[Row], None] = lambda row: None,
+    on_row: Callable[[Row], None] = lambda row: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> Study:
-    """Run on each share and seed, and keep what came of it in ``out / "subsampling.json"`` after every run.
+    """Run on each share and seed; write the outcomes to ``out / "subsampling.json"`` after every run.
 
     Runs that an earlier study of the same acquisition and settings left there are not repeated, and stay in the file.
-    ``heard`` is told of each new row, ``progress`` of the whole, 0..1.
+    ``on_row`` is called with each new row, ``progress`` with the share of the whole study, 0..1.
 
     Raises:
         SettingsError: see :func:`plan`.
         OutputExistsError: ``out`` holds another study, or foreign files.
-        SpecimapError: leaves that concern the whole study: the cube does not open, the disk is full, a stop.
+        SpecimapError: errors that concern the whole study: the cube does not open, the disk is full, a stop.
     """
     settings.check()
     runs = plan(shares, seeds)
     key = _key(capture, settings)
     prepare_folder(out)
     target = out / FILE
-    rows = {(row.share, row.seed): row for row in _earlier(target, key)}
+    rows = {(row.share, row.seed): row for row in _read_earlier(target, key)}
 
     def keep() -> Study:
         study = Study(
@@ -114,7 +114,7 @@ def study_subsampling(
             row = _run(capture, out, settings, share, seed, progress=whole, cancelled=cancelled)
             rows[share, seed] = row
             keep()
-            heard(row)
+            on_row(row)
         whole(1.0)
     return keep()
 
@@ -129,7 +129,7 @@ def _run(
     progress: Callable[[float], None],
     cancelled: Callable[[], bool],
 ) -> Row:
-    chosen = list(capture.photos) if share == 100 else some(capture.photos, share / 100, seed)
+    chosen = list(capture.photos) if share == 100 else random_subset(capture.photos, share / 100, seed)
     with scratch_in(out) as aside:
         photos = aside / "photos"
         photos.mkdir()
@@ -151,7 +151,7 @@ def _key(capture: Capture, settings: PipelineSettings) -> str:
     return register_key(surface_keys(digests, settings)["render"], open_cube(capture.cube).fingerprint(), settings)
 
 
-def _earlier(target: Path, key: str) -> list[Row]:
+def _read_earlier(target: Path, key: str) -> list[Row]:
     if not target.exists():
         return []
     try:

@@ -1,4 +1,4 @@
-"""Studies and validations in rows of text: for a terminal, a page of markdown, a page of HTML."""
+"""Tables of studies and validations as text: for a terminal, Markdown or HTML."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
 
     def markdown(self) -> str:
-        """As GitHub writes tables."""
+        """Write the table in GitHub's Markdown."""
         lines = [f"| {' | '.join(row)} |" for row in (self.headings, *self.rows)]
         return "\n".join([lines[0], "|" + "---|" * len(self.headings), *lines[1:]])
 
@@ -46,7 +46,7 @@ STUDY_HEADINGS = (
 
 
 def study_cells(row: StudyRow) -> tuple[str, ...]:
-    """One run, as the headings say."""
+    """Return the cells of one run, in the order of the headings."""
     found = row.outcome.figures
     start = f"{row.share} %", str(row.seed)
     if found is None:
@@ -65,7 +65,7 @@ def study_cells(row: StudyRow) -> tuple[str, ...]:
 
 
 def study_table(rows: Sequence[StudyRow]) -> Table:
-    """All runs of a study."""
+    """Make the table of all runs of a study."""
     return Table("Every run", STUDY_HEADINGS, tuple(study_cells(row) for row in rows))
 
 
@@ -92,7 +92,7 @@ VALIDATION_HEADINGS = (
 
 
 def pooled_cells(name: str, rows: Sequence[v.Row]) -> tuple[str, ...]:
-    """Runs of one variant in one line: means of what the reports state, medians of the true errors, the worst in
+    """Pool runs of one variant in one line: means of the reported figures, medians of the true errors, the worst in
     brackets, the least coverage."""
     method, form = rows[0].method, rows[0].adjustment
     found = [row.outcome.figures for row in rows if row.outcome.figures is not None]
@@ -103,16 +103,16 @@ def pooled_cells(name: str, rows: Sequence[v.Row]) -> tuple[str, ...]:
         return (label, f"{method}, {form}", *(NOTHING,) * 9)
     means = np.array([f.corner_2d_mm.mean for f in found])
     spread = float(np.sqrt(np.mean([f.corner_2d_mm.std**2 for f in found]) + means.var()))
-    deep = [f.corner_3d_mm for f in found if f.corner_3d_mm is not None]
+    corners_3d = [f.corner_3d_mm for f in found if f.corner_3d_mm is not None]
     left_out = [f.leave_one_marker_out_mm for f in found if f.leave_one_marker_out_mm is not None]
     truth = [f.truth for f in found if f.truth is not None]
-    three = [np.median([getattr(d, k) for d in deep]) for k in ("median", "q1", "q3")] if deep else []
+    quartiles = [np.median([getattr(d, k) for d in corners_3d]) for k in ("median", "q1", "q3")] if corners_3d else []
     scale = max((t.scale for t in truth), key=abs, default=float("nan"))
     return (
         label,
         f"{method}, {form}",
         f"{means.mean():.3f} ± {spread:.3f}",
-        f"{three[0]:.3f} ({three[1]:.3f}-{three[2]:.3f})" if deep else NOTHING,
+        f"{quartiles[0]:.3f} ({quartiles[1]:.3f}-{quartiles[2]:.3f})" if corners_3d else NOTHING,
         f"{np.median(left_out):.3f}" if left_out else NOTHING,
         _with_worst([t.median_mm for t in truth], 3),
         _with_worst([t.p95_mm for t in truth], 2),
@@ -140,18 +140,18 @@ def _with_worst(values: Sequence[float], digits: int) -> str:
 
 
 def _published_cells() -> tuple[str, ...]:
-    flat = ", ".join(f"{mean:.3f} ± {sd:.3f}" for mean, sd in published.CORNER_2D_MM)
-    deep = ", ".join(f"{median:.3f}" for median in published.CORNER_3D_MM)
-    return (f"{published.REFERENCE}, two specimens", "homography, free", flat, deep, *(NOTHING,) * 7)
+    corners_2d = ", ".join(f"{mean:.3f} ± {sd:.3f}" for mean, sd in published.CORNER_2D_MM)
+    corners_3d = ", ".join(f"{median:.3f}" for median in published.CORNER_3D_MM)
+    return (f"{published.REFERENCE}, two specimens", "homography, free", corners_2d, corners_3d, *(NOTHING,) * 7)
 
 
 def validation_tables(validation: v.Validation) -> list[Table]:
-    """By acquisition for the default and the published form, then all four forms over everything."""
+    """Make two tables: each acquisition by the default and the published form, and all four forms over all of them."""
     defects = list(dict.fromkeys(row.defect for row in validation.rows))
     by_case = [
         pooled_cells(defect, chosen)
         for defect in defects
-        for variant in (v.OURS, v.AS_PUBLISHED)
+        for variant in (v.DEFAULT, v.AS_PUBLISHED)
         if (chosen := _of(validation.rows, variant, defect))
     ]
     still = [row for row in validation.rows if row.defect != MOVED]
@@ -171,7 +171,7 @@ def _of(rows: Sequence[v.Row], variant: tuple[str, str], defect: str | None = No
 
 
 def in_words(validation: v.Validation) -> str:
-    """What the tables rest on, in a sentence or two."""
+    """Describe the basis of the tables in a sentence or two."""
     seeds = sorted({row.seed for row in validation.rows if row.seed is not None})
     size = "quick, on small phantoms" if validation.quick else "on phantoms of full size"
     return (

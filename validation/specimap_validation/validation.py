@@ -24,12 +24,12 @@ from specimap_core.report.model import Section
 from specimap_validation.capture import Capture, find_capture
 from specimap_validation.cases import Case
 from specimap_validation.phantom import load_truth, write_phantom
-from specimap_validation.runs import Outcome, run_and_judge, scratch_in, stopping
+from specimap_validation.runs import Outcome, run_and_judge, scratch_in, stoppable
 
 SCHEMA_VERSION = 1
 FILE = "validation.json"
 MARK = "validation"
-"""Name of the place in the documentation that takes the tables."""
+"""Name of the marks in the documentation between which the tables are put."""
 VARIANTS: tuple[tuple[Method, Form], ...] = (
     ("camera", "rigid"),
     ("homography", "rigid"),
@@ -37,13 +37,13 @@ VARIANTS: tuple[tuple[Method, Form], ...] = (
     ("homography", "free"),
 )
 """Registration and adjustment. The order matters: two that share an adjustment share stages 1 to 3."""
-OURS, AS_PUBLISHED = VARIANTS[0], VARIANTS[3]
-_MAKING = 0.3
-"""Part of a case's time that making its phantom takes."""
+DEFAULT, AS_PUBLISHED = VARIANTS[0], VARIANTS[3]
+_PHANTOM_SHARE = 0.3
+"""Share of a case's time that making its phantom takes."""
 
 
 class Row(Section):
-    """One run: on which case, by which variant. ``key``: a hash of the case, the program and its version."""
+    """One run: its case and its variant. ``key``: a hash of the case, the program and its version."""
 
     defect: str
     seed: int | None
@@ -69,26 +69,27 @@ def validate(
     *,
     quick: bool = False,
     progress: Callable[[float], None] = lambda share: None,
-    heard: Callable[[Row], None] = lambda row: None,
+    on_row: Callable[[Row], None] = lambda row: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> Validation:
-    """Run each case by each variant; keep what came of it in ``out / "validation.json"`` after every case.
+    """Run each case by each variant; write the outcomes to ``out / "validation.json"`` after every case.
 
     Cases that an earlier, interrupted validation left there are not repeated. Phantoms and results are made in a
-    folder aside and removed as soon as they are judged.
+    temporary folder and removed as soon as they are judged. ``on_row`` is called with each new row, ``progress`` with
+    the share of the whole validation, 0..1.
 
     Raises:
         OutputExistsError: ``out`` holds foreign files, or a validation of another version.
-        SpecimapError: leaves that concern the whole validation: the disk is full, a stop.
+        SpecimapError: errors that concern the whole validation: the disk is full, a stop.
     """
     prepare_folder(out)
     target = out / FILE
-    kept = {(row.key, row.method, row.adjustment): row for row in _earlier(target)}
+    kept = {(row.key, row.method, row.adjustment): row for row in _read_earlier(target)}
     rows: list[Row] = []
 
     def keep() -> Validation:
         done = {(row.key, row.method, row.adjustment) for row in rows}
-        # Rows of cases still to come stay in the file, so that a stop loses none.
+        # Earlier rows of cases that are still to run stay in the file, so that a stop loses none.
         waiting = [row for place, row in kept.items() if place not in done and row.key in keys]
         whole = Validation(specimap_version=__version__, quick=quick, rows=[*rows, *waiting])
         write_text(target, whole.model_dump_json(indent=1))
@@ -101,22 +102,22 @@ def validate(
         if all(row is not None for row in found):
             rows += [row for row in found if row is not None]
         else:
-            fresh = _runs(case, key, out, part, cancelled)
+            fresh = _run_variants(case, key, out, part, cancelled)
             rows += fresh
             keep()
             for row in fresh:
-                heard(row)
+                on_row(row)
         part(1.0)
     return keep()
 
 
-def _runs(
+def _run_variants(
     case: Case, key: str, out: Path, progress: Callable[[float], None], cancelled: Callable[[], bool]
 ) -> list[Row]:
-    """The four variants into one folder, so that they share what they have in common."""
+    """Run the four variants into one folder, so that they share stages."""
     rows = []
     with scratch_in(out) as aside:
-        capture = _capture(case, aside, stopping(within(progress, 0, _MAKING), cancelled))
+        capture = _capture(case, aside, stoppable(within(progress, 0, _PHANTOM_SHARE), cancelled))
         edge_mm = load_truth(capture.folder).edge_mm
         for number, (method, form) in enumerate(VARIANTS):
             start = PipelineSettings()
@@ -126,13 +127,13 @@ def _runs(
                 reconstruct=replace(start.reconstruct, edge_mm=edge_mm),
                 register=replace(start.register, method=method),
             )
-            share = (1 - _MAKING) / len(VARIANTS)
+            share = (1 - _PHANTOM_SHARE) / len(VARIANTS)
             outcome = run_and_judge(
                 Inputs(capture.photos[0].parent, capture.cube),
                 aside / "out",
                 settings,
                 capture.folder,
-                progress=within(progress, _MAKING + number * share, _MAKING + (number + 1) * share),
+                progress=within(progress, _PHANTOM_SHARE + number * share, _PHANTOM_SHARE + (number + 1) * share),
                 cancelled=cancelled,
             )
             rows.append(
@@ -159,7 +160,7 @@ def _key(case: Case) -> str:
     return hashlib.sha256(json_text(parts, sort_keys=True).encode()).hexdigest()[:24]
 
 
-def _earlier(target: Path) -> list[Row]:
+def _read_earlier(target: Path) -> list[Row]:
     if not target.exists():
         return []
     try:

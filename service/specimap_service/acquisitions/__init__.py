@@ -1,1 +1,1 @@
-"""Acquisitions, their files and how these are judged."""
+"""Acquisitions, their files, and the judging of arriving files."""

@@ -1,4 +1,4 @@
-"""Whether there is room for a file: limits of size and number, the key's quota, the disks."""
+"""Limits on arriving files: their size and number, the key's quota, free disk space."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from specimap_service.errors import PayloadTooLargeError, QuotaExceededError
 
 
 def locked_acquisition(session: Session, acquisition_id: str) -> Acquisition:
-    """The acquisition, its row locked until the transaction ends. Raises NotFoundError.
+    """Return the acquisition, its row locked until the transaction ends. Raises NotFoundError.
 
-    By a write that changes nothing, since SQLite begins a transaction, and takes its lock, at the first write only.
+    The lock is taken by a write that changes nothing: SQLite begins a transaction at the first write only.
     """
     session.execute(
         sa.update(Acquisition).where(Acquisition.id == acquisition_id).values(notes=Acquisition.notes),
@@ -32,18 +32,18 @@ def locked_acquisition(session: Session, acquisition_id: str) -> Acquisition:
 
 
 def no_acquisition(acquisition_id: str) -> NotFoundError:
-    """The error for an unknown acquisition."""
+    """Make the error for an unknown acquisition."""
     return NotFoundError(f"There is no acquisition {acquisition_id}.", advice="GET /v1/acquisitions lists all.")
 
 
-def largest(settings: ServiceSettings, role: str) -> int:
-    """Most bytes of a file of a role."""
+def max_file_bytes(settings: ServiceSettings, role: str) -> int:
+    """Return the most bytes that a file of a role may have."""
     return settings.max_photo_bytes if role == "photo" else settings.max_cube_bytes
 
 
 def check_size(settings: ServiceSettings, role: str, size: int) -> None:
     """Raise PayloadTooLargeError where a file is larger than its role allows."""
-    limit = largest(settings, role)
+    limit = max_file_bytes(settings, role)
     if size > limit:
         what = "photo" if role == "photo" else "cube file"
         raise PayloadTooLargeError(
@@ -87,7 +87,7 @@ def check_quota(session: Session, principal: Principal, new: int) -> None:
 
 
 def quota_left(session: Session, principal: Principal) -> int:
-    """Bytes that the key may still store; uploads under way count whole."""
+    """Return the bytes that the key may still store; unfinished uploads count with their full size."""
     stored = session.scalar(sa.select(sa.func.sum(StoredFile.size)).where(StoredFile.created_by == principal.key_id))
     coming = session.scalar(
         sa.select(sa.func.sum(Upload.size)).where(Upload.created_by == principal.key_id, Upload.state == "open")
@@ -96,7 +96,7 @@ def quota_left(session: Session, principal: Principal) -> int:
 
 
 def check_disks(context: AppContext, new: int, coming: int = 0) -> None:
-    """Raise StorageFullError where ``new`` bytes, with those still ``coming``, leave less than the reserve."""
+    """Raise StorageFullError where ``new`` bytes, and those still ``coming``, leave less free than the reserve."""
     with disk_errors(context.settings.scratch):
         free = shutil.disk_usage(context.settings.scratch).free
     stored = context.storage.free_bytes()

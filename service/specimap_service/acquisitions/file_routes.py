@@ -18,7 +18,7 @@ from specimap_service.acquisitions.capacity import (
 from specimap_service.acquisitions.intake import forget_part
 from specimap_service.acquisitions.routes import check_idle
 from specimap_service.acquisitions.schemas import AcquisitionId, File, FileId
-from specimap_service.auth.keys import Reader, Uploader
+from specimap_service.auth.dependencies import Reader, Uploader
 from specimap_service.byte_ranges import ranged_response
 from specimap_service.context import Context, audit
 
@@ -27,7 +27,7 @@ router = APIRouter(prefix="/v1", tags=["files"])
 
 @router.get("/acquisitions/{acquisition_id}/files")
 def list_files(context: Context, principal: Reader, acquisition_id: AcquisitionId) -> list[File]:
-    """All files with their judgement, in the order in which they came."""
+    """List all files with their judgement, in the order of their arrival."""
     with context.database.session() as session:
         if session.get(Acquisition, acquisition_id) is None:
             raise no_acquisition(acquisition_id)
@@ -39,7 +39,7 @@ def list_files(context: Context, principal: Reader, acquisition_id: AcquisitionI
 
 @router.get("/acquisitions/{acquisition_id}/files/{file_id}")
 def get_file(context: Context, principal: Reader, acquisition_id: AcquisitionId, file_id: FileId) -> File:
-    """One file."""
+    """Return one file."""
     with context.database.session() as session:
         return File.model_validate(_found(session, acquisition_id, file_id))
 
@@ -52,7 +52,7 @@ def get_file(context: Context, principal: Reader, acquisition_id: AcquisitionId,
 def get_content(
     context: Context, principal: Reader, request: Request, acquisition_id: AcquisitionId, file_id: FileId
 ) -> Response:
-    """The file's bytes as they were uploaded; ranges and ETags are understood."""
+    """Return the file's bytes as they were uploaded; ranges and ETags are supported."""
     with context.database.session() as session:
         row = _found(session, acquisition_id, file_id)
     kind = MEDIA_TYPES.get(PurePosixPath(row.label).suffix) if row.role == "photo" else None
@@ -61,7 +61,7 @@ def get_content(
 
 @router.delete("/acquisitions/{acquisition_id}/files/{file_id}", status_code=204)
 def delete_file(context: Context, principal: Uploader, acquisition_id: AcquisitionId, file_id: FileId) -> None:
-    """Delete a file, to send a better one. Not while a job works on the acquisition."""
+    """Delete a file, to send a better one. Refused while a job works on the acquisition."""
     with context.database.session() as session:
         locked_acquisition(session, acquisition_id)
         row = _found(session, acquisition_id, file_id)

@@ -8,10 +8,11 @@ from typing import Any
 
 from specimap_core.errors import CubeHeaderError
 from specimap_infra.errors import JobConflictError
+from specimap_infra.storage import Storage
 from specimap_infra.tables import StoredFile
+from specimap_service.acquisitions.judge import Judge
 from specimap_service.acquisitions.schemas import CubeJudgement, Judged, PhotoJudgement
 from specimap_service.auth.keys import Principal
-from specimap_service.context import AppContext
 
 OTHER_PART = {"header": "data", "data": "header"}
 REFERENCES = ("white", "dark")
@@ -63,7 +64,7 @@ class Findings:
     other: tuple[StoredFile, CubeJudgement] | None = None
 
 
-def judged(context: AppContext, arrival: Arrival, known: Known, folder: Path) -> Findings:
+def judged(judge: Judge, storage: Storage, arrival: Arrival, known: Known, folder: Path) -> Findings:
     """Judge the file ``file`` in ``folder``, which holds nothing else.
 
     Raises:
@@ -71,11 +72,11 @@ def judged(context: AppContext, arrival: Arrival, known: Known, folder: Path) ->
         BackendUnavailableError: nothing can be judged now.
     """
     if arrival.role == "photo":
-        return _photo(context, arrival, known, folder / "file")
-    return _cube(context, arrival, known, folder)
+        return _photo(judge, arrival, known, folder / "file")
+    return _cube(judge, storage, arrival, known, folder)
 
 
-def _photo(context: AppContext, arrival: Arrival, known: Known, path: Path) -> Findings:
+def _photo(judge: Judge, arrival: Arrival, known: Known, path: Path) -> Findings:
     for photo in known.photos:
         if photo.sha256 == arrival.sha256:
             own = PhotoJudgement.model_validate(photo.judgement).model_copy(
@@ -91,16 +92,16 @@ def _photo(context: AppContext, arrival: Arrival, known: Known, path: Path) -> F
     others = [PhotoJudgement.model_validate(photo.judgement) for photo in known.photos]
     sharpness = [j.sharpness for j in others if j.sharpness is not None and j.code != "photo_blurred"]
     sizes = [(j.width, j.height) for j in others if j.width is not None and j.height is not None]
-    verdict = context.judge.photo(path, known.dictionary, sharpness, sizes)
+    verdict = judge.photo(path, known.dictionary, sharpness, sizes)
     return Findings(verdict.pop("suffix"), PhotoJudgement.model_validate(verdict))
 
 
-def _cube(context: AppContext, arrival: Arrival, known: Known, folder: Path) -> Findings:
+def _cube(judge: Judge, storage: Storage, arrival: Arrival, known: Known, folder: Path) -> Findings:
     there = known.of_role(arrival.role)
     header = there.get("header")
     expected = None if header is None else header.judgement.get("expected_bytes")
     claimed = PurePosixPath(arrival.name).suffix.lower()
-    verdict = context.judge.part(folder / "file", claimed, expected)
+    verdict = judge.part(folder / "file", claimed, expected)
     suffix: str = verdict.pop("suffix")
     own = CubeJudgement.model_validate(verdict)
     if own.verdict == "refused":
@@ -109,14 +110,14 @@ def _cube(context: AppContext, arrival: Arrival, known: Known, folder: Path) -> 
     path = folder / f"{arrival.role}{suffix}"
     (folder / "file").rename(path)
     if own.part == "whole":
-        own = CubeJudgement.model_validate({"part": "whole", **context.judge.cube(path)})
+        own = CubeJudgement.model_validate({"part": "whole", **judge.cube(path)})
         return Findings(suffix, _fitted(arrival.role, own, known))
     other = there.get(OTHER_PART[own.part])
     if other is None:
         own = own.model_copy(update={"waiting_for": OTHER_PART[own.part]})
         return Findings(suffix, _fitted(arrival.role, own, known))
-    context.storage.fetch(other.storage_key, folder / other.label)
-    pair = context.judge.cube(folder / f"{arrival.role}.hdr")
+    storage.fetch(other.storage_key, folder / other.label)
+    pair = judge.cube(folder / f"{arrival.role}.hdr")
     own, others = _paired(own, CubeJudgement.model_validate(other.judgement), pair)
     return Findings(suffix, _fitted(arrival.role, own, known), (other, _fitted(arrival.role, others, known)))
 

@@ -1,4 +1,4 @@
-"""A file that has arrived whole: judged, stored, and written into the tables; the same for every way of uploading."""
+"""Judge and store a file that has arrived whole, by whichever way it was uploaded."""
 
 from __future__ import annotations
 
@@ -19,19 +19,20 @@ from specimap_infra.errors import DatabaseUnavailableError, JobConflictError
 from specimap_infra.tables import Acquisition, StoredFile, Upload
 from specimap_service.acquisitions.capacity import check_count, check_quota, locked_acquisition, no_acquisition
 from specimap_service.acquisitions.inspection import Arrival, Findings, Known, judged
+from specimap_service.acquisitions.judge import Judge
 from specimap_service.context import AppContext, audit
 
 ATTEMPTS = 5
-"""The other part of a cube may arrive, or go, while one is judged; it is then judged again."""
+"""The other part of a cube may arrive or be deleted while one is judged; it is then judged again."""
 LONGEST_NAME = 255
 
 
-def shown_name(name: str) -> str:
-    """A client's file name, fit to be stored and shown: no control characters, not too long."""
+def clean_name(name: str) -> str:
+    """Return a client's file name without control characters, and not too long to be stored and shown."""
     return re.sub(r"[\x00-\x1f\x7f\ud800-\udfff]", "", name)[:LONGEST_NAME]
 
 
-def take_in(context: AppContext, arrival: Arrival) -> StoredFile:
+def take_in(context: AppContext, judge: Judge, arrival: Arrival) -> StoredFile:
     """Judge and store a file; a refused one is stored too, to be shown.
 
     Raises:
@@ -40,32 +41,32 @@ def take_in(context: AppContext, arrival: Arrival) -> StoredFile:
         QuotaExceededError, StorageFullError, StorageUnavailableError, BackendUnavailableError: try again later.
     """
     key = f"acquisitions/{arrival.acquisition_id}/{arrival.file_id}"
-    moved = False
+    stored_already = False
     try:
         for _ in range(ATTEMPTS):
             known = _known(context, arrival.acquisition_id)
-            with _aside(context) as folder:
-                if moved:
+            with _judging_folder(context) as folder:
+                if stored_already:
                     context.storage.fetch(key, folder / "file")
                 else:
                     with disk_errors(folder):
                         os.link(arrival.path, folder / "file")
                 try:
-                    findings = judged(context, arrival, known, folder)
+                    findings = judged(judge, context.storage, arrival, known, folder)
                 except NotFoundError:  # the other part was deleted meanwhile
                     continue
-            if not moved:
-                moved = True
+            if not stored_already:
+                stored_already = True
                 context.storage.put_file(key, arrival.path)
-            stored = _written(context, arrival, known, findings, key)
+            stored = _add_row(context, arrival, known, findings, key)
             if stored is not None:
                 context.metrics.judged.labels(findings.own.verdict).inc()
                 return stored
     except DatabaseUnavailableError:
-        # The commit may have come through all the same: what it speaks of must be there.
+        # The commit may have succeeded all the same: the file that its row names must stay.
         raise
     except BaseException:
-        if moved:
+        if stored_already:
             context.storage.delete(key)
         raise
     context.storage.delete(key)
@@ -87,8 +88,8 @@ def _files(session: Session, acquisition_id: str) -> tuple[StoredFile, ...]:
 
 
 @contextmanager
-def _aside(context: AppContext) -> Iterator[Path]:
-    """A folder of its own, in which the file lies under a name of ours."""
+def _judging_folder(context: AppContext) -> Iterator[Path]:
+    """Make a folder for one file, to be judged under a name that the program chose."""
     folder = context.settings.scratch / "judging" / uuid.uuid4().hex
     with disk_errors(folder):
         folder.mkdir(parents=True)
@@ -101,12 +102,12 @@ def _aside(context: AppContext) -> Iterator[Path]:
 # ---- writing ------------------------------------------------------------------------------------------
 
 
-def _written(context: AppContext, arrival: Arrival, known: Known, findings: Findings, key: str) -> StoredFile | None:
-    """The row of the stored file; None where what the judgement rests on has changed meanwhile."""
+def _add_row(context: AppContext, arrival: Arrival, known: Known, findings: Findings, key: str) -> StoredFile | None:
+    """Add the row of the stored file; None where files that the judgement depends on have changed meanwhile."""
     with context.database.session() as session:
         locked_acquisition(session, arrival.acquisition_id)
         files = _files(session, arrival.acquisition_id)
-        if _basis(arrival, files) != _basis(arrival, known.files):
+        if _relevant_ids(arrival, files) != _relevant_ids(arrival, known.files):
             return None
         if arrival.principal is not None:
             check_quota(session, arrival.principal, arrival.size)
@@ -155,7 +156,7 @@ def _written(context: AppContext, arrival: Arrival, known: Known, findings: Find
     return stored
 
 
-def _basis(arrival: Arrival, files: tuple[StoredFile, ...]) -> set[str]:
+def _relevant_ids(arrival: Arrival, files: tuple[StoredFile, ...]) -> set[str]:
     if arrival.role == "photo":
         return {f.id for f in files if f.sha256 == arrival.sha256 and f.state == "accepted"}
     return {f.id for f in files if f.role != "photo" and f.state == "accepted"}
@@ -170,7 +171,7 @@ def _label(role: str, suffix: str, state: str, labels: set[str]) -> str:
 
 
 def forget_part(session: Session, file: StoredFile) -> None:
-    """After a part of a cube was deleted the other one waits for it again."""
+    """Let the other part of a cube wait for this one again, which is being deleted."""
     if file.role == "photo" or file.state != "accepted" or file.judgement["part"] == "whole":
         return
     for other in _files(session, file.acquisition_id):

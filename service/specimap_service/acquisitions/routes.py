@@ -1,4 +1,4 @@
-"""Acquisitions: what was captured of one specimen, under a pseudonym."""
+"""Acquisitions: the photos and the cube of one specimen, under a pseudonym."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from specimap_infra.ids import new_id
 from specimap_infra.job_schemas import EdgeMm
 from specimap_infra.tables import FINAL_STATES, Acquisition, Job, StoredFile, Upload
 from specimap_service.acquisitions.capacity import locked_acquisition, no_acquisition
-from specimap_service.acquisitions.deletion import Leftovers
+from specimap_service.acquisitions.dependencies import JudgeDep, UnfinishedUploadsDep
 from specimap_service.acquisitions.schemas import AcquisitionId, Dictionary, FileCounts, counts
-from specimap_service.auth.keys import Admin, Reader, Uploader
+from specimap_service.auth.dependencies import Admin, Reader, Uploader
+from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import Context, audit
+from specimap_service.jobs.deletion import JobFiles
 from specimap_service.paging import After, Limit, Moment, Page, page_of
-from specimap_service.uploads.routes import Files
 
 router = APIRouter(prefix="/v1", tags=["acquisitions"])
 PSEUDONYM = r"^[A-Za-z0-9._-]{1,64}$"
@@ -46,7 +47,7 @@ class AcquisitionRequest(BaseModel):
 
 
 class AcquisitionView(BaseModel):
-    """An acquisition, what has arrived of it, and what is missing."""
+    """An acquisition, the files that have arrived, and those that are missing."""
 
     model_config = ConfigDict(title="Acquisition", from_attributes=True)
 
@@ -57,22 +58,24 @@ class AcquisitionView(BaseModel):
     edge_mm: float
     notes: str
     created_at: datetime.datetime
-    created_by: str = Field(description="The key that made it.")
+    created_by: str = Field(description="Id of the key that created it.")
     files: FileCounts
     ready: bool = Field(description="Whether a job can run.")
     missing: list[str] = Field(description="What is still needed, a sentence each.")
 
 
 @router.post("/acquisitions", status_code=201)
-def create_acquisition(context: Context, principal: Uploader, wanted: AcquisitionRequest) -> AcquisitionView:
-    """Make an acquisition; then upload its photos and its cube."""
+def create_acquisition(
+    context: Context, principal: Uploader, judge: JudgeDep, wanted: AcquisitionRequest
+) -> AcquisitionView:
+    """Create an acquisition; then upload its photos and its cube."""
     row = Acquisition(id=new_id("acq"), created_by=principal.key_id, created_at=utc_now(), **wanted.model_dump())
     with context.database.session() as session:
         session.add(row)
         audit(session, principal.key_id, "acquisition.create", row.id)
         session.flush()
         view = _view(session, row)
-    context.judge.warm()
+    judge.warm()
     return view
 
 
@@ -82,12 +85,12 @@ def list_acquisitions(
     principal: Reader,
     specimen_id: Annotated[str | None, Query(max_length=64)] = None,
     accession_number: Annotated[str | None, Query(max_length=64)] = None,
-    created_after: Annotated[Moment | None, Query(description="Only those made at this time or later.")] = None,
-    created_before: Annotated[Moment | None, Query(description="Only those made before this time.")] = None,
+    created_after: Annotated[Moment | None, Query(description="Only those created at this time or later.")] = None,
+    created_before: Annotated[Moment | None, Query(description="Only those created before this time.")] = None,
     after: After = None,
     limit: Limit = 50,
 ) -> Page[AcquisitionView]:
-    """Acquisitions, newest first."""
+    """List acquisitions, newest first."""
     query = sa.select(Acquisition).order_by(Acquisition.id.desc()).limit(limit + 1)
     for column, value in ((Acquisition.specimen_id, specimen_id), (Acquisition.accession_number, accession_number)):
         if value is not None:
@@ -106,7 +109,7 @@ def list_acquisitions(
 
 @router.get("/acquisitions/{acquisition_id}")
 def get_acquisition(context: Context, principal: Reader, acquisition_id: AcquisitionId) -> AcquisitionView:
-    """One acquisition."""
+    """Return one acquisition."""
     with context.database.session() as session:
         row = session.get(Acquisition, acquisition_id)
         if row is None:
@@ -115,20 +118,26 @@ def get_acquisition(context: Context, principal: Reader, acquisition_id: Acquisi
 
 
 @router.delete("/acquisitions/{acquisition_id}", status_code=204)
-def delete_acquisition(context: Context, principal: Admin, files: Files, acquisition_id: AcquisitionId) -> None:
-    """Delete an acquisition and all that hangs on it: files, jobs, results, labels, exports. It cannot be undone."""
+def delete_acquisition(
+    context: Context,
+    principal: Admin,
+    uploads: UnfinishedUploadsDep,
+    clouds: CloudsDep,
+    acquisition_id: AcquisitionId,
+) -> None:
+    """Delete an acquisition with its files, jobs, results, labels and exports. This cannot be undone."""
     with context.database.session() as session:
         row = locked_acquisition(session, acquisition_id)
         check_idle(session, acquisition_id)
         jobs = list(session.scalars(sa.select(Job.id).where(Job.acquisition_id == acquisition_id)))
-        leftovers = Leftovers.of(session, jobs)
+        job_files = JobFiles.of(session, jobs)
         open_uploads = list(session.scalars(sa.select(Upload.id).where(Upload.acquisition_id == acquisition_id)))
         session.delete(row)
         audit(session, principal.key_id, "acquisition.delete", acquisition_id, jobs=jobs)
     for upload_id in open_uploads:
-        files.remove(upload_id)
+        uploads.remove(upload_id)
     context.storage.delete(f"acquisitions/{acquisition_id}")
-    leftovers.remove(context)
+    job_files.remove(context.storage, clouds)
 
 
 def check_idle(session: Session, acquisition_id: str) -> None:

@@ -13,7 +13,7 @@ from specimap_infra.completeness import DATA, HEADER
 from specimap_infra.tables import StoredFile
 
 Role = Literal["photo", "cube", "white", "dark"]
-Word = Literal["accepted", "doubtful", "refused"]
+VerdictName = Literal["accepted", "doubtful", "refused"]
 AcquisitionId = Annotated[str, Path(pattern=r"^acq_[0-9a-z]{26}$", examples=["acq_01k0000000000000000000000"])]
 FileId = Annotated[str, Path(pattern=r"^file_[0-9a-z]{26}$", examples=["file_01k0000000000000000000000"])]
 Dictionary = Literal[
@@ -51,28 +51,28 @@ class Remark(BaseModel):
 
 
 class Judged(BaseModel):
-    """What every judgement says."""
+    """The fields of every judgement."""
 
-    verdict: Word = Field(description="`doubtful`: usable, but better retaken. `refused`: no job uses the file.")
+    verdict: VerdictName = Field(description="`doubtful`: usable, but better retaken. `refused`: no job uses the file.")
     code: str | None = Field(description="Stable code; docs/errors.md lists all. Null where there is nothing to say.")
     reason: str = Field(description="What is wrong, in a sentence.")
     advice: str = Field(description="What to do.")
 
 
 class PhotoJudgement(Judged):
-    """About a photo."""
+    """The judgement of a photo."""
 
     kind: Literal["photo"] = "photo"
     width: int | None = Field(description="Pixels of the upright photo.")
     height: int | None
     sharpness: float | None = Field(description="In the least sharp direction; comparable within an acquisition.")
-    marker_ids: list[int] = Field(description="Markers of the acquisition's dictionary that read.")
+    marker_ids: list[int] = Field(description="Markers of the acquisition's dictionary that were read.")
     dictionary_seen: str | None = Field(description="Where the markers are of another dictionary: which.")
     same_as: str | None = Field(None, description="Where the same photo is there already: its label.")
 
 
 class CubeJudgement(Judged):
-    """About a file of a cube or a reference. An ENVI cube's header and data are judged together once both are there."""
+    """The judgement of a file of a cube or a reference. An ENVI cube's header and data are judged together."""
 
     kind: Literal["cube"] = "cube"
     part: Literal["header", "data", "whole"]
@@ -127,8 +127,8 @@ class File(BaseModel):
 
     id: str
     role: Role
-    label: str = Field(description="What results call it.")
-    name: str = Field(description="What the client called it; shown, and used for nothing.")
+    label: str = Field(description="Its name in results.")
+    name: str = Field(description="The name that the client gave; it is only shown.")
     size: int = Field(description="Bytes.")
     sha256: str
     state: Literal["accepted", "refused"] = Field(description="Refused files take no part in a job.")
@@ -137,7 +137,7 @@ class File(BaseModel):
 
 
 class FileCounts(BaseModel):
-    """What has arrived."""
+    """The files that have arrived."""
 
     photos: int = Field(description="Accepted photos.")
     refused: int = Field(description="Refused files of all roles.")

@@ -1,1 +1,1 @@
-"""Keys and what they allow."""
+"""Keys, their scopes and their rate limits; the audit trail."""

@@ -1,4 +1,4 @@
-"""Who may do what: keys with scopes. A key is ``spk_<id>_<secret>`` in ``Authorization: Bearer``, never in a URL."""
+"""Keys with scopes. A key is ``spk_<id>_<secret>`` in ``Authorization: Bearer``, never in a URL."""
 
 from __future__ import annotations
 
@@ -8,32 +8,23 @@ import hmac
 import secrets
 import threading
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
-
-import structlog
-from fastapi import Depends, Request
-from fastapi.concurrency import run_in_threadpool
-from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from specimap_infra.database import Database, utc_now
 from specimap_infra.ids import new_id
 from specimap_infra.tables import SCOPES, ApiKey
-from specimap_service.context import AppContext
-from specimap_service.errors import ForbiddenError, UnauthorizedError
+from specimap_service.errors import UnauthorizedError
 
 KEPT_SECONDS = 2.0
 """How long a looked-up key is trusted before the database is asked again: the delay of a revocation."""
 USED_EVERY = datetime.timedelta(minutes=1)
-FAILURES_PER_MINUTE = 60
-"""Wrong keys that one address may present a minute, before it is told to wait."""
 PREFIX = "spk"
 
 
 @dataclass(frozen=True)
 class Principal:
-    """The key that a request came with."""
+    """The key of a request."""
 
     key_id: str
     scopes: frozenset[str]
@@ -49,7 +40,7 @@ def new_key(
     rate_per_minute: int | None = None,
     quota_bytes: int | None = None,
 ) -> tuple[ApiKey, str]:
-    """A row to store, and the key itself, which is nowhere kept."""
+    """Make a row to store, and the key itself, which is kept nowhere."""
     row_id, secret = new_id("key"), secrets.token_hex(32)
     row = ApiKey(
         id=row_id,
@@ -79,10 +70,10 @@ class Keyring:
         self._lock = threading.Lock()
 
     def principal(self, key: str) -> Principal:
-        """Who a key belongs to.
+        """Return the principal of a key.
 
         Raises:
-            UnauthorizedError: it is unknown, expired or revoked; which of these is not told.
+            UnauthorizedError: it is unknown, expired or revoked; the error does not say which.
         """
         found = self.trusted(key)
         if found is not None:
@@ -95,13 +86,13 @@ class Keyring:
         return principal
 
     def trusted(self, key: str) -> Principal | None:
-        """Who a key belongs to, if it was looked up a moment ago; asks no database."""
+        """Return the principal of a key that was looked up a moment ago; asks no database."""
         with self._lock:
             found = self._kept.get(_hash(key))
         return found[1] if found is not None and time.monotonic() - found[0] < KEPT_SECONDS else None
 
     def forget(self) -> None:
-        """Trust nothing that was looked up before."""
+        """Look every key up again."""
         with self._lock:
             self._kept.clear()
 
@@ -110,7 +101,7 @@ class Keyring:
         name, _, secret = rest.partition("_")
         with self._database.session() as session:
             row = session.get(ApiKey, f"key_{name}") if prefix == PREFIX else None
-            # Compared even where there is no such key, so that the time taken says nothing.
+            # Compared even where there is no such key, so that the time taken gives nothing away.
             same = hmac.compare_digest(_hash(secret), row.secret_hash if row else "0" * 64)
             now = utc_now()
             if (
@@ -131,58 +122,3 @@ class Keyring:
                 row.rate_per_minute or self._defaults[0],
                 row.quota_bytes or self._defaults[1],
             )
-
-
-PRINCIPAL = "specimap.principal"
-"""Where a request's scope holds its principal, once that is known."""
-
-
-async def authenticated(request: Request) -> Principal:
-    """The principal of a request by its headers alone; one request more of its key's rate.
-
-    Raises:
-        UnauthorizedError: there is no key, or no valid one. RateLimitedError: too many requests, or wrong keys.
-        DatabaseUnavailableError: keys cannot be looked up.
-    """
-    keyring: Keyring = request.app.state.keyring
-    context: AppContext = request.app.state.context
-    kind, _, key = request.headers.get("authorization", "").partition(" ")
-    if kind.lower() != "bearer" or not key.strip():
-        raise UnauthorizedError("There is no key.", advice="Send it as `Authorization: Bearer <key>`.")
-    key = key.strip()
-    try:
-        found = keyring.trusted(key)
-        if found is None:
-            # A thread costs as much as the rest of a short request: it is taken only to ask the database.
-            found = await run_in_threadpool(keyring.principal, key)
-    except UnauthorizedError:
-        address = request.client.host if request.client else "unknown"
-        context.limiter.take(f"address:{address}", FAILURES_PER_MINUTE)
-        raise
-    context.limiter.take(found.key_id, found.rate_per_minute)
-    structlog.contextvars.bind_contextvars(key=found.key_id)
-    return found
-
-
-_bearer = HTTPBearer(auto_error=False, scheme_name="key", description="`Authorization: Bearer spk_…`")
-
-
-def requires(scope: str) -> Callable[..., Awaitable[Principal]]:
-    """A dependency: the request's principal, if its key has the scope. ``admin`` has all."""
-
-    async def principal(
-        request: Request, _: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
-    ) -> Principal:
-        # Known already where the request may have a body: no byte of it is read before.
-        found: Principal = request.scope.get(PRINCIPAL) or await authenticated(request)
-        if scope not in found.scopes and "admin" not in found.scopes:
-            raise ForbiddenError(f"The key lacks the scope {scope!r}.", advice="Use a key that has it.", scope=scope)
-        return found
-
-    return principal
-
-
-Uploader = Annotated[Principal, Depends(requires("upload"))]
-Reader = Annotated[Principal, Depends(requires("read"))]
-Labeller = Annotated[Principal, Depends(requires("label"))]
-Admin = Annotated[Principal, Depends(requires("admin"))]

@@ -1,4 +1,4 @@
-"""How many requests a key may make: a token bucket for each key in each API process."""
+"""Rate limit of requests: a token bucket for each key in each API process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Keys: made, listed, revoked by an administrator; and the audit trail."""
+"""Keys, created, listed and revoked by an administrator; and the audit trail."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import datetime
 from typing import Annotated, Any, Literal
 
 import sqlalchemy as sa
-from fastapi import APIRouter, Path, Query, Request
+from fastapi import APIRouter, Path, Query
 from pydantic import BaseModel, ConfigDict, Field
 
 from specimap_core.errors import NotFoundError
 from specimap_infra.database import utc_now
 from specimap_infra.tables import ApiKey, AuditEntry
-from specimap_service.auth.keys import Admin, Keyring, new_key
+from specimap_service.auth.dependencies import Admin, KeyringDep
+from specimap_service.auth.keys import new_key
 from specimap_service.context import Context, audit
 from specimap_service.paging import Limit, Moment, Page, page_of
 
@@ -21,7 +22,7 @@ KeyId = Annotated[str, Path(pattern=r"^key_[0-9a-z]{26}$")]
 
 
 class KeyRequest(BaseModel):
-    """What a new key may do."""
+    """A key to be created."""
 
     model_config = ConfigDict(
         extra="forbid", json_schema_extra={"example": {"name": "tablet 3", "scopes": ["upload", "read"]}}
@@ -51,13 +52,13 @@ class Key(BaseModel):
 
 
 class NewKey(Key):
-    """A key that was just made."""
+    """A key that was just created."""
 
     key: str = Field(description="The key itself; it is shown this once and kept nowhere.")
 
 
 class Audited(BaseModel):
-    """Who did what to which thing."""
+    """An entry of the audit trail: which key did what to which object."""
 
     model_config = ConfigDict(from_attributes=True)
 
@@ -72,7 +73,7 @@ class Audited(BaseModel):
 
 @router.post("/keys", status_code=201)
 def create_key(context: Context, principal: Admin, wanted: KeyRequest) -> NewKey:
-    """Make a key."""
+    """Create a key."""
     row, key = new_key(
         wanted.name,
         wanted.scopes,
@@ -88,13 +89,13 @@ def create_key(context: Context, principal: Admin, wanted: KeyRequest) -> NewKey
 
 @router.get("/keys")
 def list_keys(context: Context, principal: Admin) -> list[Key]:
-    """All keys, revoked ones too."""
+    """List all keys, revoked ones too."""
     with context.database.session() as session:
         return [Key.model_validate(row) for row in session.scalars(sa.select(ApiKey).order_by(ApiKey.id))]
 
 
 @router.delete("/keys/{key_id}", status_code=204)
-def revoke_key(context: Context, principal: Admin, request: Request, key_id: KeyId) -> None:
+def revoke_key(context: Context, principal: Admin, keyring: KeyringDep, key_id: KeyId) -> None:
     """Revoke a key; it is refused within two seconds everywhere."""
     with context.database.session() as session:
         row = session.get(ApiKey, key_id)
@@ -102,7 +103,6 @@ def revoke_key(context: Context, principal: Admin, request: Request, key_id: Key
             raise NotFoundError(f"There is no key {key_id}.", advice="GET /v1/keys lists all.")
         row.revoked_at = row.revoked_at or utc_now()
         audit(session, principal.key_id, "key.revoke", key_id)
-    keyring: Keyring = request.app.state.keyring
     keyring.forget()
 
 
@@ -111,12 +111,12 @@ def list_audit(
     context: Context,
     principal: Admin,
     target: Annotated[
-        str | None, Query(pattern=r"^[a-z]{2,5}_[0-9a-z]{26}$", description="Only what was done to this thing.")
+        str | None, Query(pattern=r"^[a-z]{2,5}_[0-9a-z]{26}$", description="Only entries about this object.")
     ] = None,
     after: Annotated[int | None, Query(ge=1, description="`next` of the page before.")] = None,
     limit: Limit = 100,
 ) -> Page[Audited]:
-    """Who did what, newest first."""
+    """List the audit trail, newest entry first."""
     query = sa.select(AuditEntry).order_by(AuditEntry.id.desc()).limit(limit + 1)
     if target is not None:
         query = query.where(AuditEntry.target == target)

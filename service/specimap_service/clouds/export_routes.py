@@ -1,4 +1,4 @@
-"""Results as files of other programs: made once, by a worker, and kept."""
+"""Exports: results as files for other programs, made once by a worker and kept."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from specimap_infra.ids import new_id
 from specimap_infra.labels import current_labels, fingerprint, lock_cloud
 from specimap_infra.queue import EXPORTS, MAKE_EXPORT, enqueue
 from specimap_infra.tables import PRIORITIES
-from specimap_service.auth.keys import Reader
+from specimap_service.auth.dependencies import Reader
 from specimap_service.byte_ranges import REVALIDATED, ranged_response
+from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.clouds.open_clouds import CloudRecord
 from specimap_service.context import AppContext, Context, audit, correlation_id
 
@@ -32,8 +33,8 @@ class Export(BaseModel):
     id: str
     cloud_id: str
     format: FileFormat
-    state: str = Field(description="As of a job: queued, running, succeeded, failed.", examples=["succeeded"])
-    size: int | None = Field(description="Bytes, once it is there.")
+    state: str = Field(description="As for a job: queued, running, succeeded, failed.", examples=["succeeded"])
+    size: int | None = Field(description="Bytes, once it exists.")
     error: dict[str, Any] | None = Field(description="Code, message, advice and details of the failure.")
     created_at: datetime.datetime
     links: dict[str, str]
@@ -42,17 +43,17 @@ class Export(BaseModel):
 @router.post(
     "/{format}",
     status_code=202,
-    responses={200: {"model": Export, "description": "It is there."}},
+    responses={200: {"model": Export, "description": "The file exists already."}},
 )
 def create_export(
-    context: Context, principal: Reader, response: Response, cloud_id: CloudId, format: FileFormat
+    context: Context, principal: Reader, clouds: CloudsDep, response: Response, cloud_id: CloudId, format: FileFormat
 ) -> Export:
-    """Have a file made, once for each format; asked again, tells how far it is.
+    """Have a file made, once for each format; asked again, return its state.
 
-    One that failed is tried again under a new id. `zarr` holds the label layers; where these have changed since, it is
-    made anew.
+    A failed export is tried again under a new id. `zarr` holds the label layers; if they have changed since, it is
+    made again.
     """
-    cloud = context.clouds.record(cloud_id)
+    cloud = clouds.record(cloud_id)
     response.headers["Location"] = f"/v1/clouds/{cloud_id}/exports/{format.value}"
     if format is FileFormat.MESH_PLY:
         response.status_code = 200
@@ -90,24 +91,24 @@ def create_export(
     if replaced is not None:
         context.storage.delete(f"exports/{replaced}")
     response.status_code = 200 if row.state == "succeeded" else 202
-    return _shown(row)
+    return _view(row)
 
 
 @router.get("")
-def list_exports(context: Context, principal: Reader, cloud_id: CloudId) -> list[Export]:
-    """The files that are there or under way; `mesh-ply` always is."""
-    cloud = context.clouds.record(cloud_id)
+def list_exports(context: Context, principal: Reader, clouds: CloudsDep, cloud_id: CloudId) -> list[Export]:
+    """List the files that exist or are being made; `mesh-ply` always exists."""
+    cloud = clouds.record(cloud_id)
     query = sa.select(tables.Export).where(tables.Export.cloud_id == cloud_id).order_by(tables.Export.id.desc())
     with context.database.session() as session:
         rows = list(session.scalars(query))
-    return [*map(_shown, rows), _mesh_ply(context, cloud)]
+    return [*map(_view, rows), _mesh_ply(context, cloud)]
 
 
 @router.get("/{format}")
-def get_export(context: Context, principal: Reader, cloud_id: CloudId, format: FileFormat) -> Export:
-    """How far a file is."""
-    cloud = context.clouds.record(cloud_id)
-    return _mesh_ply(context, cloud) if format is FileFormat.MESH_PLY else _shown(_found(context, cloud_id, format))
+def get_export(context: Context, principal: Reader, clouds: CloudsDep, cloud_id: CloudId, format: FileFormat) -> Export:
+    """Return the state of a file."""
+    cloud = clouds.record(cloud_id)
+    return _mesh_ply(context, cloud) if format is FileFormat.MESH_PLY else _view(_found(context, cloud_id, format))
 
 
 FILE: dict[int | str, dict[str, Any]] = {
@@ -118,20 +119,20 @@ FILE: dict[int | str, dict[str, Any]] = {
             for media in sorted({kind.media_type for kind in KINDS.values()})
         },
     },
-    206: {"description": "The range of it that was asked for."},
-    304: {"description": "The client has it."},
-    412: {"description": "It is not the one that If-Match names."},
-    416: {"description": "The range lies outside."},
+    206: {"description": "The range that was requested."},
+    304: {"description": "The client has the current file."},
+    412: {"description": "The file is not the one that If-Match names."},
+    416: {"description": "The range lies outside of the file."},
 }
 
 
 @router.head("/{format}/content", response_class=Response, responses=FILE, operation_id="head_export_content")
 @router.get("/{format}/content", response_class=Response, responses=FILE)
 def get_content(
-    context: Context, principal: Reader, request: Request, cloud_id: CloudId, format: FileFormat
+    context: Context, principal: Reader, clouds: CloudsDep, request: Request, cloud_id: CloudId, format: FileFormat
 ) -> Response:
-    """The file itself; single byte ranges, so that a broken download goes on."""
-    cloud = context.clouds.record(cloud_id)
+    """Return the file itself; single byte ranges let a broken download continue."""
+    cloud = clouds.record(cloud_id)
     if format is FileFormat.MESH_PLY:
         key: str | None = _mesh_key(cloud)
     else:
@@ -168,7 +169,7 @@ def _mesh_key(cloud: CloudRecord) -> str:
 
 
 def _mesh_ply(context: AppContext, cloud: CloudRecord) -> Export:
-    """The mesh as the run left it: an export that needs no row."""
+    """Describe the mesh as the run wrote it: an export that needs no row."""
     return Export(
         id=cloud.id.replace("cloud_", "exp_"),
         cloud_id=cloud.id,
@@ -181,7 +182,7 @@ def _mesh_ply(context: AppContext, cloud: CloudRecord) -> Export:
     )
 
 
-def _shown(row: tables.Export) -> Export:
+def _view(row: tables.Export) -> Export:
     return Export(
         id=row.id,
         cloud_id=row.cloud_id,

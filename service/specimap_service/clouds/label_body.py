@@ -1,4 +1,4 @@
-"""Labels as they arrive: metadata in a header, values as an Arrow IPC stream or a npy file."""
+"""Request bodies with labels: metadata in a header, values as an Arrow IPC stream or a npy file."""
 
 from __future__ import annotations
 
@@ -31,17 +31,19 @@ EXAMPLE: dict[str, Any] = {
 
 
 class LabelClass(BaseModel):
-    """What a number stands for."""
+    """A class: its number, name and colour."""
 
     model_config = ConfigDict(extra="forbid")
 
     value: int = Field(ge=0, le=LARGEST_CLASS)
     name: str = Field(min_length=1, max_length=100)
-    colour: str | None = Field(default=None, pattern=r"^#[0-9a-fA-F]{6}$", description="Null is not drawn.")
+    colour: str | None = Field(
+        default=None, pattern=r"^#[0-9a-fA-F]{6}$", description="A class with null is not drawn."
+    )
 
 
 class MadeBy(BaseModel):
-    """Which model or person made a layer; further fields are kept."""
+    """The model or person that made a layer; further fields are kept."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -51,7 +53,7 @@ class MadeBy(BaseModel):
 
 
 class LabelMetadata(BaseModel):
-    """What the header holds, as JSON."""
+    """The header's contents, as JSON."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"example": EXAMPLE})
 
@@ -72,15 +74,15 @@ class LabelMetadata(BaseModel):
         return self
 
     def as_stored(self) -> dict[str, Any]:
-        """Plain JSON values."""
+        """Return plain JSON values."""
         return self.model_dump(mode="json", exclude_none=True)
 
 
 def parse_metadata(header: str | None) -> LabelMetadata:
-    """The header's JSON.
+    """Parse the header's JSON.
 
     Raises:
-        RequestInvalidError: it is missing, or does not fit; details list the fields.
+        RequestInvalidError: the header is missing or invalid; details list the fields.
     """
     if header is None:
         raise RequestInvalidError(f"The header {HEADER} is missing.", advice=f"An example: {EXAMPLE_TEXT}")
@@ -100,13 +102,13 @@ EXAMPLE_TEXT = LabelMetadata.model_validate(EXAMPLE).model_dump_json(exclude_non
 
 
 def most_bytes(metadata: LabelMetadata, points: int) -> int:
-    """Bytes that a body of 64-bit values can have; a larger one cannot fit the cloud."""
+    """Return the bytes that a body of 64-bit values can have; a larger one cannot fit the cloud."""
     columns = 1 if metadata.kind == "class" else max(1, len(metadata.classes))
     return points * columns * 8 + 1024 * 1024
 
 
 def parse_values(body: Path, arrow: bool, metadata: LabelMetadata, points: int) -> Array:
-    """The checked values, as they are stored, of a body in a file.
+    """Return the checked values, as they are stored, of a body in a file.
 
     Raises:
         RequestInvalidError: the body does not decode.
@@ -116,7 +118,7 @@ def parse_values(body: Path, arrow: bool, metadata: LabelMetadata, points: int) 
         values = _from_arrow(body, metadata, points) if arrow else np.lib.format.open_memmap(body, mode="r")
     except LabelInvalidError:
         raise
-    except Exception as error:  # the readers of foreign bytes raise nearly anything, StopIteration and TokenError too
+    except Exception as error:  # on bad input the readers raise nearly anything, StopIteration and TokenError too
         what = "an Arrow IPC stream" if arrow else "a npy file"
         raise RequestInvalidError(
             f"The body is not {what} of numbers: {re.sub(r'/[^ ]*', 'it', str(error))[:200]}.",
@@ -126,7 +128,7 @@ def parse_values(body: Path, arrow: bool, metadata: LabelMetadata, points: int) 
 
 
 def _from_arrow(body: Path, metadata: LabelMetadata, points: int) -> Array:
-    """Values (S,) of the column ``value`` (``probability`` for such), or (S, C) of one column a class."""
+    """Read values (S,) of the column ``value`` or ``probability``, or (S, C) of one column for each class."""
     with pa.memory_map(str(body)) as source:
         messages = pa.ipc.MessageReader.open_stream(source)
         schema = pa.ipc.read_schema(messages.read_next_message())
@@ -183,13 +185,13 @@ def _block(batch: pa.RecordBatch, columns: list[str], metadata: LabelMetadata) -
 
 
 def _compressed(metadata: bytes) -> bool:
-    """Whether a record batch's message says that its buffers are compressed: what they unpack to has no bound.
+    """Return whether a record batch's buffers are compressed: their unpacked size has no bound.
 
-    ``metadata`` is a flatbuffer; pyarrow does not tell this field of it.
+    ``metadata`` is a flatbuffer, a field of which pyarrow does not expose.
     """
 
     def field(table: int, number: int) -> int:
-        """Where a table's field lies; 0 where it has none."""
+        """Return the position of a table's field; 0 where it has none."""
         vtable = table - struct.unpack_from("<i", metadata, table)[0]
         slot = 4 + 2 * number
         if vtable < 0 or slot >= struct.unpack_from("<H", metadata, vtable)[0]:

@@ -1,4 +1,4 @@
-"""Label layers: written back by classifiers and people, versioned, read as arrays."""
+"""Label layers: written by classifiers and people, versioned, read as arrays."""
 
 from __future__ import annotations
 
@@ -22,8 +22,17 @@ from specimap_core.atomic import disk_errors, remove
 from specimap_core.cloud.shards import PointArray
 from specimap_infra.labels import current_labels
 from specimap_infra.tables import LabelVersion
-from specimap_service.array_responses import ARROW, JSON, NPY, arrow_answer, chosen_type, documented, json_answer
-from specimap_service.auth.keys import Labeller, Reader
+from specimap_service.array_responses import (
+    ARROW,
+    JSON,
+    NPY,
+    arrow_answer,
+    chosen_type,
+    documented_responses,
+    json_answer,
+)
+from specimap_service.auth.dependencies import Labeller, Reader
+from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.clouds.label_body import (
     EXAMPLE_TEXT,
     HEADER,
@@ -35,7 +44,7 @@ from specimap_service.clouds.label_body import (
     parse_values,
 )
 from specimap_service.clouds.label_store import Conditions, delete_label, find_label, no_label, put_label
-from specimap_service.clouds.open_clouds import LabelRecord
+from specimap_service.clouds.open_clouds import LabelRecord, OpenClouds
 from specimap_service.context import AppContext, Context
 from specimap_service.errors import MediaTypeError, PayloadTooLargeError
 
@@ -58,7 +67,7 @@ class Label(BaseModel):
     kind: str
     classes: list[LabelClass]
     made_by: MadeBy
-    sha256: str = Field(description="Of values and metadata: the same content has the same one.")
+    sha256: str = Field(description="Hash of values and metadata: equal content has an equal hash.")
     created_at: datetime.datetime
     created_by: str
     links: dict[str, str]
@@ -73,7 +82,7 @@ class LabelValues(BaseModel):
     kind: str
     classes: list[LabelClass]
     values: list[int] | list[float | None] | list[list[float | None]] = Field(
-        description="One a point; of probabilities of several classes a list a point, in the order of the classes."
+        description="One for each point; for probabilities of several classes a list in the order of the classes."
     )
 
 
@@ -83,12 +92,13 @@ BINARY = {"schema": {"type": "string", "format": "binary"}}
 @router.put(
     "/clouds/{cloud_id}/labels/{name}",
     status_code=201,
-    responses={200: {"model": Label, "description": "The current version is the same; nothing has changed."}},
+    responses={200: {"model": Label, "description": "The current version is the same; nothing was changed."}},
     openapi_extra={"requestBody": {"required": True, "content": {ARROW: BINARY, NPY: BINARY}}},
 )
 async def put(
     context: Context,
     principal: Labeller,
+    clouds: CloudsDep,
     request: Request,
     response: Response,
     cloud_id: CloudId,
@@ -97,28 +107,28 @@ async def put(
         str | None,
         Header(alias=HEADER, description="Kind, classes and made_by as JSON. Required.", examples=[EXAMPLE_TEXT]),
     ] = None,
-    if_match: Annotated[str | None, Header(description='The version to replace, as `"3"`; `*`: any.')] = None,
-    if_none_match: Annotated[str | None, Header(description="`*`: only where there is no such layer.")] = None,
+    if_match: Annotated[str | None, Header(description='The version to replace, as `"3"`; `*`: any version.')] = None,
+    if_none_match: Annotated[str | None, Header(description="`*`: store only if there is no such layer.")] = None,
 ) -> Label:
     """Store a layer's next version, in the order of the cloud's points.
 
-    An Arrow stream holds one column `value`, or for probabilities of several classes one column a class, named as
+    An Arrow stream holds one column `value`, or for probabilities of several classes one column for each, named as
     the class; it is not compressed. A npy file holds (S,), or (S, C) in the order of `classes`. Kind `class`: whole
     numbers, each that of a class; name a class for unlabelled points too. Kind `probability`: 0 to 1; NaN or null
-    says nothing of a point.
+    where it is unknown.
     """
     metadata, conditions = parse_metadata(label), Conditions.of(if_match, if_none_match)
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media not in (ARROW, NPY):
         raise MediaTypeError(f"{HEADER} comes with an array.", advice=f"Send {ARROW} or {NPY}.", offered=[ARROW, NPY])
-    points = (await run_in_threadpool(context.clouds.record, cloud_id)).points
+    points = (await run_in_threadpool(clouds.record, cloud_id)).points
     scratch = context.settings.scratch / f"label-{uuid4().hex}.body.tmp"
     try:
         await _receive(request, scratch, most_bytes(metadata, points))
 
         def store() -> tuple[LabelVersion, bool]:
             values = parse_values(scratch, media == ARROW, metadata, points)
-            return put_label(context, principal, cloud_id, name, metadata, values, conditions)
+            return put_label(context, clouds, principal, cloud_id, name, metadata, values, conditions)
 
         row, new = await run_in_threadpool(store)
     finally:
@@ -126,7 +136,7 @@ async def put(
     response.status_code = 201 if new else 200
     response.headers["ETag"] = f'"{row.version}"'
     response.headers["Location"] = f"/v1/clouds/{cloud_id}/labels/{name}?version={row.version}"
-    return _shown(row)
+    return _view(row)
 
 
 async def _receive(request: Request, target: FilePath, limit: int) -> None:
@@ -156,46 +166,60 @@ def _append(target: FilePath, data: bytes) -> None:
 
 
 @router.get("/clouds/{cloud_id}/labels")
-def list_labels(context: Context, principal: Reader, cloud_id: CloudId) -> list[Label]:
-    """The current version of each layer, by name."""
-    context.clouds.record(cloud_id)
+def list_labels(context: Context, principal: Reader, clouds: CloudsDep, cloud_id: CloudId) -> list[Label]:
+    """List the current version of each layer, by name."""
+    clouds.record(cloud_id)
     with context.database.session() as session:
-        return [_shown(row) for row in current_labels(session, cloud_id)]
+        return [_view(row) for row in current_labels(session, cloud_id)]
 
 
 @router.get("/clouds/{cloud_id}/labels/{name}")
 def get_label(
-    context: Context, principal: Reader, response: Response, cloud_id: CloudId, name: LabelName, version: Version = None
+    context: Context,
+    principal: Reader,
+    clouds: CloudsDep,
+    response: Response,
+    cloud_id: CloudId,
+    name: LabelName,
+    version: Version = None,
 ) -> Label:
-    """A layer's metadata; its ETag is the version, for If-Match."""
-    row = _find(context, cloud_id, name, version)
+    """Return a layer's metadata; its ETag is the version, for If-Match."""
+    row = _find(context, clouds, cloud_id, name, version)
     response.headers["ETag"] = f'"{row.version}"'
-    return _shown(row)
+    return _view(row)
 
 
 @router.get("/clouds/{cloud_id}/labels/{name}/versions")
-def list_versions(context: Context, principal: Reader, cloud_id: CloudId, name: LabelName) -> list[Label]:
-    """All versions of a layer, newest first."""
-    context.clouds.record(cloud_id)
+def list_versions(
+    context: Context, principal: Reader, clouds: CloudsDep, cloud_id: CloudId, name: LabelName
+) -> list[Label]:
+    """List all versions of a layer, newest first."""
+    clouds.record(cloud_id)
     query = sa.select(LabelVersion).where(LabelVersion.cloud_id == cloud_id, LabelVersion.name == name)
     with context.database.session() as session:
         rows = list(session.scalars(query.order_by(LabelVersion.version.desc())))
     if not rows:
         raise no_label(cloud_id, name)
-    return [_shown(row) for row in rows]
+    return [_view(row) for row in rows]
 
 
-@router.get("/clouds/{cloud_id}/labels/{name}/values", response_model=None, responses=documented(LabelValues))
+@router.get("/clouds/{cloud_id}/labels/{name}/values", response_model=None, responses=documented_responses(LabelValues))
 def get_values(
-    context: Context, principal: Reader, request: Request, cloud_id: CloudId, name: LabelName, version: Version = None
+    context: Context,
+    principal: Reader,
+    clouds: CloudsDep,
+    request: Request,
+    cloud_id: CloudId,
+    name: LabelName,
+    version: Version = None,
 ) -> Response:
-    """A layer's values in the order of the cloud's points, in the forms that PUT takes, or as JSON."""
+    """Return a layer's values in the order of the cloud's points, in the formats that PUT takes, or as JSON."""
     media = chosen_type(request)
-    row = _find(context, cloud_id, name, version)
+    row = _find(context, clouds, cloud_id, name, version)
     headers = {"X-Specimap-Label-Version": str(row.version)}
     record = LabelRecord(row.name, row.version, row.kind, row.storage_prefix)
-    with context.clouds.reading(cloud_id):
-        array = context.clouds.label_array(record)
+    with clouds.reading(cloud_id):
+        array = clouds.label_array(record)
         if media == NPY:
             return _npy(array, headers)
         if media == ARROW:
@@ -234,18 +258,18 @@ def _npy(array: PointArray, headers: dict[str, str]) -> Response:
 
 
 @router.delete("/clouds/{cloud_id}/labels/{name}", status_code=204)
-def delete(context: Context, principal: Labeller, cloud_id: CloudId, name: LabelName) -> None:
+def delete(context: Context, principal: Labeller, clouds: CloudsDep, cloud_id: CloudId, name: LabelName) -> None:
     """Delete a layer with all its versions."""
-    delete_label(context, principal, cloud_id, name)
+    delete_label(context, clouds, principal, cloud_id, name)
 
 
-def _find(context: AppContext, cloud_id: str, name: str, version: int | None) -> LabelVersion:
-    context.clouds.record(cloud_id)
+def _find(context: AppContext, clouds: OpenClouds, cloud_id: str, name: str, version: int | None) -> LabelVersion:
+    clouds.record(cloud_id)
     with context.database.session() as session:
         return find_label(session, cloud_id, name, version)
 
 
-def _shown(row: LabelVersion) -> Label:
+def _view(row: LabelVersion) -> Label:
     base = f"/v1/clouds/{row.cloud_id}"
     own = f"{base}/labels/{row.name}"
     metadata = LabelMetadata(kind=row.kind, classes=row.classes, made_by=row.made_by)  # type: ignore[arg-type]

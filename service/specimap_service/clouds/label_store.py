@@ -24,6 +24,7 @@ from specimap_infra.storage import Storage
 from specimap_infra.tables import LabelVersion
 from specimap_service.auth.keys import Principal
 from specimap_service.clouds.label_body import LabelMetadata
+from specimap_service.clouds.open_clouds import OpenClouds
 from specimap_service.context import AppContext, audit
 from specimap_service.errors import PreconditionFailedError, RequestInvalidError
 
@@ -32,18 +33,18 @@ _TAG = re.compile(r'^(?:W/)?"?(\d{1,9})"?$')
 
 @dataclass(frozen=True)
 class Conditions:
-    """What a PUT is to find: If-Match (versions, or any), If-None-Match: * (none)."""
+    """Preconditions of a PUT: If-Match (versions, or any), If-None-Match: * (none)."""
 
     versions: frozenset[int] | None = None
-    """None: any, or that there is none."""
+    """None: no particular version is required."""
     exists: bool | None = None
 
     @classmethod
     def of(cls, if_match: str | None, if_none_match: str | None) -> Conditions:
-        """From the headers.
+        """Read the preconditions from the headers.
 
         Raises:
-            RequestInvalidError: they are no version.
+            RequestInvalidError: the headers hold no version.
         """
         if if_none_match is not None:
             if if_none_match.strip() != "*" or if_match is not None:
@@ -72,6 +73,7 @@ class Conditions:
 
 def put_label(
     context: AppContext,
+    clouds: OpenClouds,
     principal: Principal,
     cloud_id: str,
     name: str,
@@ -79,14 +81,14 @@ def put_label(
     values: Array,
     conditions: Conditions,
 ) -> tuple[LabelVersion, bool]:
-    """Store checked values as a layer's next version, or find that the current one is the same.
+    """Store checked values as a layer's next version, unless the current one is the same.
 
     Returns: the version, and whether it is new.
 
     Raises:
         NotFoundError: the cloud was deleted meanwhile.
         PreconditionFailedError: the conditions do not hold.
-        StorageFullError, StorageUnavailableError: nothing has changed then.
+        StorageFullError, StorageUnavailableError: nothing was changed.
     """
     digest = _digest(metadata, values)
     work = context.settings.scratch / f"label-{uuid4().hex}.tmp"
@@ -102,7 +104,7 @@ def put_label(
                     return current, False
                 conditions.check(current.version if current else None)
                 version = current.version + 1 if current else 1
-                # The suffix keeps a layer that is deleted and made again from the files of the first.
+                # The suffix keeps a layer that is deleted and created again apart from the files of the first.
                 prefix = f"clouds/{cloud_id}/labels/{name}/v{version}-{uuid4().hex[:8]}"
                 stored = metadata.as_stored()
                 row = LabelVersion(
@@ -121,18 +123,18 @@ def put_label(
                 session.flush()
                 _publish(context.storage, work, prefix, {**stored, "version": version})
         except DatabaseUnavailableError:
-            raise  # the row may be there after all, and refer to the files
+            raise  # the row may have been committed after all, and refer to the files
         except BaseException:
             if prefix is not None:
                 context.storage.delete(prefix)
             raise
     finally:
         remove(work)
-    context.clouds.forget(cloud_id)
+    clouds.forget(cloud_id)
     return row, True
 
 
-def delete_label(context: AppContext, principal: Principal, cloud_id: str, name: str) -> None:
+def delete_label(context: AppContext, clouds: OpenClouds, principal: Principal, cloud_id: str, name: str) -> None:
     """Remove a layer with all its versions.
 
     Raises:
@@ -146,13 +148,13 @@ def delete_label(context: AppContext, principal: Principal, cloud_id: str, name:
             raise no_label(cloud_id, name)
         session.execute(sa.delete(LabelVersion).where(layer))
         audit(session, principal.key_id, "label.delete", cloud_id, layer=name, versions=len(prefixes))
-    context.clouds.forget(cloud_id)
+    clouds.forget(cloud_id)
     for prefix in prefixes:
         context.storage.delete(prefix)
 
 
 def find_label(session: Session, cloud_id: str, name: str, version: int | None) -> LabelVersion:
-    """A version of a layer, by default the current one.
+    """Return a version of a layer, by default the current one.
 
     Raises:
         NotFoundError: there is none.
@@ -168,7 +170,7 @@ def find_label(session: Session, cloud_id: str, name: str, version: int | None) 
 
 
 def no_label(cloud_id: str, name: str, version: int | None = None) -> NotFoundError:
-    """The error where a layer, or a version of it, is not there."""
+    """Make the error for a layer, or a version of it, that does not exist."""
     which = "" if version is None else f" of version {version}"
     return NotFoundError(
         f"Cloud {cloud_id} has no label layer {name!r}{which}.", advice=f"GET /v1/clouds/{cloud_id}/labels lists all."

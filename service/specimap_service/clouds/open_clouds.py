@@ -1,4 +1,4 @@
-"""Open clouds, kept for the next request: what the database says of them, their files and the arrays read so far."""
+"""Open clouds, kept for later requests: their database records, files, and the arrays read so far."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from specimap_infra.storage import Storage
 from specimap_infra.tables import CloudRow, Job
 
 KEPT_SECONDS = 2.0
-"""How long a looked-up row is trusted: the delay of a deletion, and of a new label in other processes."""
+"""How long a row is used without a new query: the delay of a deletion, and of a new label in other processes."""
 MOST_CLOUDS = 64
 MOST_BYTES = 1024**3
 """Memory of the arrays that open clouds keep, about 40 bytes a point; the one in use is kept in any case."""
@@ -43,7 +43,7 @@ class LabelRecord:
 
 @dataclass(frozen=True)
 class CloudRecord:
-    """A finished cloud as the database has it, with its labels by name."""
+    """The database record of a finished cloud, with its labels by name."""
 
     id: str
     job_id: str
@@ -63,7 +63,7 @@ class CloudRecord:
 
 @dataclass(frozen=True)
 class StoredFolder:
-    """Files below a prefix of the storage, for the reader of clouds."""
+    """Files below a prefix of the storage, as the reader of clouds wants them."""
 
     storage: Storage
     prefix: str
@@ -74,16 +74,16 @@ class StoredFolder:
         return self.prefix.rpartition("/")[2]
 
     def size(self, key: str) -> int:
-        """Bytes of a file. Raises NotFoundError, StorageUnavailableError."""
+        """Return the size of a file, bytes. Raises NotFoundError, StorageUnavailableError."""
         return self.storage.stat(f"{self.prefix}/{key}").size
 
     def read(self, key: str, start: int = 0, stop: int | None = None) -> bytes:
-        """Bytes of a file. Raises NotFoundError, StorageUnavailableError."""
+        """Read the bytes of a file. Raises NotFoundError, StorageUnavailableError."""
         return self.storage.read(f"{self.prefix}/{key}", start, stop)
 
 
 class OpenClouds:
-    """Clouds by id. Safe to share between threads; a cloud that many ask for at once is opened once."""
+    """Clouds by id. Safe to share between threads; a cloud that many request at once is opened once."""
 
     def __init__(self, storage: Storage, database: Database) -> None:
         self._storage = storage
@@ -96,7 +96,7 @@ class OpenClouds:
         self._forgotten = 0
 
     def record(self, cloud_id: str) -> CloudRecord:
-        """What the database has of a cloud, at most two seconds old.
+        """Return the database record of a cloud, at most two seconds old.
 
         Raises:
             NotFoundError: there is none, or its job did not succeed.
@@ -107,7 +107,7 @@ class OpenClouds:
             if found is not None:
                 if now < found[0]:
                     return found[1]
-                # One thread asks the database; the others go on with what is known until it has answered.
+                # One thread queries the database; the others use the old record until it has answered.
                 self._records[cloud_id] = now + KEPT_SECONDS / 4, found[1]
             forgotten = self._forgotten
         try:
@@ -116,7 +116,7 @@ class OpenClouds:
             self.forget(cloud_id)
             raise
         with self._lock:
-            # What was looked up before something changed is not kept.
+            # A record that was looked up before a change is not kept.
             if forgotten == self._forgotten:
                 self._records[cloud_id] = now + KEPT_SECONDS, record
                 self._records.move_to_end(cloud_id)
@@ -125,7 +125,7 @@ class OpenClouds:
         return record
 
     def forget(self, cloud_id: str) -> None:
-        """Trust nothing that is known of a cloud: it was deleted, or its labels changed."""
+        """Drop everything kept of a cloud: it was deleted, or its labels changed."""
         with self._lock:
             self._forgotten += 1
             self._records.pop(cloud_id, None)
@@ -133,11 +133,11 @@ class OpenClouds:
 
     @contextmanager
     def reading(self, cloud_id: str) -> Iterator[tuple[CloudRecord, Cloud]]:
-        """A cloud to read from within the block.
+        """Open a cloud to read from within the block.
 
         Raises:
             NotFoundError: there is none, or it was deleted meanwhile.
-            CloudDamagedError: a file of it is missing or broken; what the reader said goes to the log only.
+            CloudDamagedError: a file of it is missing or broken; the reader's own message goes to the log only.
         """
         record = self.record(cloud_id)
         try:
@@ -153,7 +153,7 @@ class OpenClouds:
             ) from error
 
     def label_array(self, label: LabelRecord) -> PointArray:
-        """The stored values of a label. Raises CloudDamagedError; call it within :meth:`reading`."""
+        """Open the stored values of a label. Raises CloudDamagedError; call it within :meth:`reading`."""
         with self._lock:
             found = self._labels.get(label.prefix)
         if found is None:
@@ -193,7 +193,7 @@ class OpenClouds:
             raise CloudDamagedError("The cloud's files are gone.", advice="") from error
 
     def _trim(self) -> None:
-        """Let go of the clouds that were not used for longest, where they are too many or too large."""
+        """Drop the least recently used clouds while they are too many or too large."""
         now = time.monotonic()
         if len(self._clouds) <= MOST_CLOUDS and now - self._trimmed < _TRIM_SECONDS:
             return

@@ -1,4 +1,4 @@
-"""Pictures that were drawn, kept in memory up to a number of bytes."""
+"""Cache of drawn pictures in memory, up to a number of bytes."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from specimap_service.clouds.pictures import Picture
 
 MOST_BYTES = 128 * 1024**2
 DRAWN_AT_ONCE = 2
-"""Pictures drawn side by side: each takes up to some hundred megabytes while it is."""
+"""Pictures drawn at the same time: each takes up to some hundred megabytes of memory meanwhile."""
 
 
 class PictureCache:
-    """Pictures by tag, least recently used ones dropped first. Safe to share between threads."""
+    """Pictures by tag; the least recently used ones are dropped first. Safe to share between threads."""
 
     def __init__(self, most_bytes: int = MOST_BYTES) -> None:
         self._most = most_bytes
@@ -24,7 +24,7 @@ class PictureCache:
         self._drawing = threading.BoundedSemaphore(DRAWN_AT_ONCE)
 
     def get(self, tag: str, draw: Callable[[], Picture]) -> Picture:
-        """The picture of that tag, drawn if it is not there."""
+        """Return the picture of a tag, drawn if it is not cached."""
         found = self._find(tag)
         if found is not None:
             return found
@@ -38,7 +38,7 @@ class PictureCache:
 
     @property
     def kept_bytes(self) -> int:
-        """What the pictures take."""
+        """Bytes of all cached pictures."""
         return self._bytes
 
     def _find(self, tag: str) -> Picture | None:

@@ -1,4 +1,4 @@
-"""Pictures of a cloud as PNG, transparent where no point is: on the cube's own pixels, or seen from above in mm."""
+"""Pictures of a cloud as PNG, transparent where there is no point: in the cube's pixels, or seen from above in mm."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LARGEST_SIDE = 2048
 STRETCH_PERCENT = (2.0, 98.0)
 COLOUR_MAP = "viridis"
 DIM = 0.35
-"""Share of the grey of the photos under a label's colour, and its brightness where nothing is said."""
+"""Brightness of the grey photos under a label's colour, and where a point has no label."""
 BAND = re.compile(r"^(?:(\d{1,5})|(\d{1,5}(?:\.\d{1,4})?)nm)$")
 _BLOCK = 4096
 _PITCH_CELLS = 1.5
@@ -33,8 +33,8 @@ _COMPRESSION = 2
 
 
 @dataclass(frozen=True, eq=False)
-class Painted:
-    """A colour for each point: ``colours`` (S, 3) or grey (S,) uint8; ``shown`` (S,) False where it has none.
+class PointColours:
+    """Colours of all points: ``colours`` (S, 3) or grey (S,) uint8; ``shown`` (S,) False where it has none.
 
     ``range``: the values at the ends of the colour scale.
     """
@@ -46,7 +46,7 @@ class Painted:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A PNG; ``range`` as of :class:`Painted`; ``extent_mm``: x_min, y_min, x_max, y_max of its outer edges in the
+    """A PNG; ``range`` as of :class:`PointColours`; ``extent_mm``: x_min, y_min, x_max, y_max of its outer edges in the
     marker frame, where it is a view from above."""
 
     png: bytes
@@ -54,11 +54,11 @@ class Picture:
     extent_mm: tuple[float, float, float, float] | None
 
 
-# ---- which colours ------------------------------------------------------------------------------------
+# ---- colours of points --------------------------------------------------------------------------------
 
 
 def band_index(cloud: Cloud, given: str) -> int:
-    """The band of an index (``120``) or a wavelength (``640nm``, the nearest band).
+    """Return the band of an index (``120``) or a wavelength (``640nm``, the nearest band).
 
     Raises:
         RequestInvalidError: it is neither.
@@ -85,72 +85,72 @@ def band_index(cloud: Cloud, given: str) -> int:
 
 
 def read_bands(cloud: Cloud, bands: list[int]) -> NDArray[np.float32]:
-    """Decoded values (S, n) of some bands, NaN where there is none, in one pass over the cloud."""
+    """Read decoded values (S, n) of some bands, NaN where there is none, in one pass over the cloud."""
     stored = np.empty((cloud.n_points, len(bands)), np.uint16)
     for part, block in cloud.iter_chunks(_BLOCK):
         stored[part] = block[:, bands]
     return cloud.decode(stored)
 
 
-def paint_rgb(cloud: Cloud) -> Painted:
-    """The photos' colours."""
-    return Painted(cloud.rgb)
+def paint_rgb(cloud: Cloud) -> PointColours:
+    """Colour points as the photos do."""
+    return PointColours(cloud.rgb)
 
 
-def paint_band(cloud: Cloud, band: int, limits: tuple[float, float] | None) -> Painted:
-    """One band in grey, between ``limits`` or its own percentiles; points without a value are not shown."""
+def paint_band(cloud: Cloud, band: int, limits: tuple[float, float] | None) -> PointColours:
+    """Show one band in grey, between ``limits`` or its own percentiles; points without a value are not shown."""
     values = read_bands(cloud, [band])[:, 0]
     limits = limits or _percentiles(values)
-    return Painted(_levels(values, limits), _known(values), limits)
+    return PointColours(_levels(values, limits), _known(values), limits)
 
 
-def paint_composite(cloud: Cloud, bands: tuple[int, int, int]) -> Painted:
-    """Three bands as red, green and blue, each between its own percentiles; points that lack one are not shown."""
+def paint_composite(cloud: Cloud, bands: tuple[int, int, int]) -> PointColours:
+    """Show three bands as red, green and blue, each between its own percentiles; points that lack one are not shown."""
     values = read_bands(cloud, list(bands))
     channels = [_levels(values[:, i], _percentiles(values[:, i])) for i in range(3)]
-    return Painted(np.stack(channels, 1), _known(values.sum(1)))
+    return PointColours(np.stack(channels, 1), _known(values.sum(1)))
 
 
-def paint_index(cloud: Cloud, a: int, b: int, limits: tuple[float, float] | None) -> Painted:
-    """(a - b) / (a + b) of two bands as a colour scale; points where a + b is not positive are not shown."""
+def paint_index(cloud: Cloud, a: int, b: int, limits: tuple[float, float] | None) -> PointColours:
+    """Show (a - b) / (a + b) of two bands as a colour scale; points where a + b is not positive are not shown."""
     values = read_bands(cloud, [a, b]).astype(np.float64)
     total = values.sum(1)
     shown = total > 0  # False for NaN, too
     index = np.divide(values[:, 0] - values[:, 1], total, out=np.zeros(len(total)), where=shown)
     limits = limits or _percentiles(index[shown])
-    return Painted(_scale()[_levels(index, limits)], shown, limits)
+    return PointColours(_scale()[_levels(index, limits)], shown, limits)
 
 
-def paint_pca(cloud: Cloud, preview: bytes) -> Painted:
-    """The run's own ``preview.png``, a view from above in principal components, looked up at every point."""
+def paint_pca(cloud: Cloud, preview: bytes) -> PointColours:
+    """Look every point up in the run's own ``preview.png``, a view from above in principal components."""
     with Image.open(io.BytesIO(preview)) as image:
         pixels = np.asarray(image.convert("RGBA"))
     x_min, y_min, x_max, y_max = extent_mm(cloud)
     rows, cols = pixels.shape[:2]
-    # Its edges are the cloud's, give or take half a pixel; it is filled two pixels beyond any point.
+    # The preview's edges are the cloud's, to half a pixel; it is filled two pixels beyond any point.
     col = np.rint((cloud.xyz[:, 0] - x_min) * ((cols - 1) / max(x_max - x_min, 1e-9))).astype(np.intp)
     row = rows - 1 - np.rint((cloud.xyz[:, 1] - y_min) * ((rows - 1) / max(y_max - y_min, 1e-9))).astype(np.intp)
     found = pixels[np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)]
-    return Painted(np.ascontiguousarray(found[:, :3]), found[:, 3] > 0)
+    return PointColours(np.ascontiguousarray(found[:, :3]), found[:, 3] > 0)
 
 
-def paint_classes(cloud: Cloud, values: Array, classes: list[dict[str, Any]]) -> Painted:
-    """Each point in its class's colour over the dimmed photos; a class without a colour leaves these alone."""
+def paint_classes(cloud: Cloud, values: Array, classes: list[dict[str, Any]]) -> PointColours:
+    """Show each point in its class's colour over the dimmed photos; a class without a colour shows these alone."""
     lut = np.zeros((65536, 3), np.float32)
     drawn = np.zeros(65536, bool)
     for item in classes:
         if item.get("colour"):
             lut[item["value"]] = [int(item["colour"][i : i + 2], 16) for i in (1, 3, 5)]
             drawn[item["value"]] = True
-    return Painted(_over(cloud, lut[values], drawn[values]))
+    return PointColours(_over(cloud, lut[values], drawn[values]))
 
 
-def paint_probability(cloud: Cloud, values: Array, limits: tuple[float, float] | None) -> Painted:
-    """Probabilities (S,) as a colour scale over the dimmed photos, which stand alone where the value is NaN."""
+def paint_probability(cloud: Cloud, values: Array, limits: tuple[float, float] | None) -> PointColours:
+    """Show probabilities (S,) as a colour scale over the dimmed photos, and these alone where the value is NaN."""
     limits = limits or (0.0, 1.0)
-    said = ~np.isnan(values)
-    levels = _levels(np.where(said, values, 0), limits)
-    return Painted(_over(cloud, _scale()[levels].astype(np.float32), said), range=limits)
+    known = ~np.isnan(values)
+    levels = _levels(np.where(known, values, 0), limits)
+    return PointColours(_over(cloud, _scale()[levels].astype(np.float32), known), range=limits)
 
 
 def _over(cloud: Cloud, colours: NDArray[np.float32], drawn: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -159,7 +159,7 @@ def _over(cloud: Cloud, colours: NDArray[np.float32], drawn: NDArray[np.bool_]) 
 
 
 def _known(values: Array) -> NDArray[np.bool_] | None:
-    """Which of the values (S,) are some; None where all are."""
+    """Return which of the values (S,) are not NaN; None where all are."""
     known = ~np.isnan(values)
     return None if known.all() else known
 
@@ -173,7 +173,7 @@ def _percentiles(values: Array) -> tuple[float, float]:
 
 
 def _levels(values: Array, limits: tuple[float, float]) -> NDArray[np.uint8]:
-    """0..255 between the limits; 128 everywhere where these are the same, 0 for NaN."""
+    """Scale to 0..255 between the limits; 128 everywhere if these are equal, 0 for NaN."""
     low, high = limits
     if not high > low:
         return np.full(len(values), 128, np.uint8)
@@ -183,25 +183,25 @@ def _levels(values: Array, limits: tuple[float, float]) -> NDArray[np.uint8]:
 
 @lru_cache(maxsize=1)
 def _scale() -> NDArray[np.uint8]:
-    """256 colours of equal perceived steps, (256, 3)."""
+    """Return 256 colours of equal perceived steps, (256, 3)."""
     return np.asarray(np.rint(np.asarray(Colormap(COLOUR_MAP).lut(256))[:, :3] * 255), np.uint8)
 
 
-# ---- where --------------------------------------------------------------------------------------------
+# ---- drawing ------------------------------------------------------------------------------------------
 
 
-def draw(cloud: Cloud, painted: Painted, grid: Grid, size: int) -> Picture:
-    """The picture, its longer side at most ``size`` pixels.
+def draw(cloud: Cloud, points: PointColours, grid: Grid, size: int) -> Picture:
+    """Draw the picture, its longer side at most ``size`` pixels.
 
-    ``cube``: the cube's pixels, row 0 at the top, made smaller where they are more than ``size``. ``marker``: the
-    view from above, x to the right, y up, in cells as wide as the points' distance or wider.
+    ``cube``: the cube's pixels, row 0 at the top, reduced where they are more than ``size``. ``marker``: the
+    view from above, x to the right, y up, in cells at least as wide as the points' distance.
     """
     extent: tuple[float, float, float, float] | None = None
-    colours = painted.colours if painted.colours.ndim == 2 else painted.colours[:, None]
+    colours = points.colours if points.colours.ndim == 2 else points.colours[:, None]
     if grid == "cube":
-        pixels = _on_cube(cloud, colours, painted.shown)
+        pixels = _on_cube(cloud, colours, points.shown)
     else:
-        pixels, extent = _from_above(cloud, colours, painted.shown, size)
+        pixels, extent = _from_above(cloud, colours, points.shown, size)
     image = Image.fromarray(pixels, "LA" if pixels.shape[2] == 2 else "RGBA")
     if max(image.size) > size:
         share = size / max(image.size)
@@ -209,11 +209,11 @@ def draw(cloud: Cloud, painted: Painted, grid: Grid, size: int) -> Picture:
         image = image.resize((width, height), Image.Resampling.BOX)
     out = io.BytesIO()
     image.save(out, "PNG", compress_level=_COMPRESSION)
-    return Picture(out.getvalue(), painted.range, extent)
+    return Picture(out.getvalue(), points.range, extent)
 
 
 def _on_cube(cloud: Cloud, colours: NDArray[np.uint8], shown: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
-    """(rows, cols, channels + 1), alpha last: a pixel has at most one point."""
+    """Draw in the cube's pixels, (rows, cols, channels + 1), alpha last; a pixel has at most one point."""
     row, col = cloud.hsi_pixel.T.astype(np.intp)
     match cloud.attributes.get("cube_shape"):
         case [int(rows), int(cols), *_]:
@@ -231,7 +231,7 @@ def _on_cube(cloud: Cloud, colours: NDArray[np.uint8], shown: NDArray[np.bool_] 
 def _from_above(
     cloud: Cloud, colours: NDArray[np.uint8], shown: NDArray[np.bool_] | None, size: int
 ) -> tuple[NDArray[np.uint8], tuple[float, float, float, float]]:
-    """The same from above, y up: means over the topmost points of each cell; and its outer edges, mm."""
+    """Draw the view from above, y up, as means over the topmost points of each cell; and return its outer edges, mm."""
     x_min, y_min, x_max, y_max = extent_mm(cloud)
     # Neighbours in the cloud's order mostly are neighbours in the cube.
     steps = np.linalg.norm(np.diff(cloud.xyz[:, :2], axis=0), axis=1)

@@ -1,29 +1,34 @@
-"""Pictures of a cloud: colours, bands, indices, labels."""
+"""Pictures of a cloud: colours, bands, normalised differences, labels."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Depends, Path, Query, Request, Response
 
 from specimap_core import __version__
 from specimap_core.cloud import Cloud
 from specimap_core.errors import NotFoundError
 from specimap_core.json_text import json_text
-from specimap_service.auth.keys import Reader
+from specimap_service.auth.dependencies import Reader
 from specimap_service.clouds import pictures
+from specimap_service.clouds.dependencies import CloudsDep, PicturesDep
 from specimap_service.clouds.label_store import find_label
-from specimap_service.clouds.open_clouds import LabelRecord
-from specimap_service.clouds.pictures import LARGEST_SIDE, Grid, Painted, Picture
-from specimap_service.context import AppContext, Context
+from specimap_service.clouds.open_clouds import LabelRecord, OpenClouds
+from specimap_service.clouds.picture_cache import PictureCache
+from specimap_service.clouds.pictures import LARGEST_SIDE, Grid, Picture, PointColours
+from specimap_service.context import Context
 from specimap_service.errors import RequestInvalidError
 
 router = APIRouter(prefix="/v1/clouds/{cloud_id}/previews", tags=["previews"])
 CloudId = Annotated[str, Path(pattern=r"^cloud_[0-9a-z]{26}$")]
 Size = Annotated[int, Query(ge=16, le=LARGEST_SIDE, description="Most pixels of the longer side; never enlarged.")]
-Where = Annotated[Grid, Query(description="`cube`: the cube's own pixels; `marker`: from above, x to the right, y up.")]
+GridChoice = Annotated[
+    Grid, Query(description="`cube`: the cube's own pixels; `marker`: from above, x to the right, y up.")
+]
 Low = Annotated[
     float | None,
     Query(allow_inf_nan=False, description="Value at the lower end of the scale; by default the 2nd percentile."),
@@ -34,7 +39,7 @@ High = Annotated[
 ]
 BAND = r"^(\d{1,5}|\d{1,5}(\.\d{1,4})?nm)$"
 TRUE_COLOUR = ("640nm", "550nm", "460nm")
-Paint = Callable[[Cloud], Painted]
+Paint = Callable[[Cloud], PointColours]
 
 
 def _band(description: str) -> Any:
@@ -43,7 +48,7 @@ def _band(description: str) -> Any:
 
 PNG: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "PNG, transparent where no point is.",
+        "description": "PNG, transparent where there is no point.",
         "content": {"image/png": {"schema": {"type": "string", "format": "binary"}}},
         "headers": {
             "ETag": {"schema": {"type": "string"}},
@@ -57,119 +62,164 @@ PNG: dict[int | str, dict[str, Any]] = {
             },
         },
     },
-    304: {"description": "The client has it."},
+    304: {"description": "The client has the current picture."},
 }
+
+
+@dataclass(frozen=True)
+class Previews:
+    """Answers to one request with a picture of a cloud, drawn or cached."""
+
+    clouds: OpenClouds
+    cache: PictureCache
+    request: Request
+
+    def picture(self, cloud_id: str, grid: Grid, size: int, paint: Paint, parameters: list[Any]) -> Response:
+        """Answer with a picture; ``parameters`` are everything else that it depends on."""
+        self.clouds.record(cloud_id)
+        # A cloud never changes: parameters and program version identify the picture.
+        identity = json_text([__version__, cloud_id, grid, size, *parameters])
+        tag = hashlib.sha256(identity.encode()).hexdigest()[:32]
+        headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache", "Vary": "Authorization"}
+        known = [part.strip().removeprefix("W/") for part in self.request.headers.get("if-none-match", "").split(",")]
+        if f'"{tag}"' in known or "*" in known:
+            return Response(status_code=304, headers=headers)
+
+        def draw() -> Picture:
+            with self.clouds.reading(cloud_id) as (_, cloud):
+                return pictures.draw(cloud, paint(cloud), grid, size)
+
+        picture = self.cache.get(tag, draw)
+        if picture.range is not None:
+            headers["X-Specimap-Range"] = ",".join(f"{value:.6g}" for value in picture.range)
+        if picture.extent_mm is not None:
+            headers["X-Specimap-Extent-Mm"] = ",".join(f"{value:.4f}" for value in picture.extent_mm)
+        return Response(picture.png, headers=headers, media_type="image/png")
+
+
+async def previews_of_request(request: Request, clouds: CloudsDep, cache: PicturesDep) -> Previews:
+    """Combine the objects that pictures need: a dependency, ``async`` so that it takes no thread."""
+    return Previews(clouds, cache, request)
+
+
+PreviewsDep = Annotated[Previews, Depends(previews_of_request)]
 
 
 @router.get("/rgb.png", response_class=Response, responses=PNG)
 def rgb(
-    context: Context, principal: Reader, request: Request, cloud_id: CloudId, size: Size = 1024, grid: Where = "cube"
+    principal: Reader,
+    previews: PreviewsDep,
+    cloud_id: CloudId,
+    size: Size = 1024,
+    grid: GridChoice = "cube",
 ) -> Response:
-    """The photos' colours."""
-    return _picture(context, request, cloud_id, grid, size, pictures.paint_rgb, ["rgb"])
+    """Show the photos' colours."""
+    return previews.picture(cloud_id, grid, size, pictures.paint_rgb, ["rgb"])
 
 
 @router.get("/pca.png", response_class=Response, responses=PNG)
 def pca(
-    context: Context, principal: Reader, request: Request, cloud_id: CloudId, size: Size = 1024, grid: Where = "cube"
+    context: Context,
+    principal: Reader,
+    previews: PreviewsDep,
+    cloud_id: CloudId,
+    size: Size = 1024,
+    grid: GridChoice = "cube",
 ) -> Response:
-    """The first three principal components of the spectra as colours, as the run drew them."""
+    """Show the first three principal components of the spectra as colours, as the run drew them."""
 
-    def paint(cloud: Cloud) -> Painted:
-        prefix = context.clouds.record(cloud_id).prefix
+    def paint(cloud: Cloud) -> PointColours:
+        prefix = previews.clouds.record(cloud_id).prefix
         return pictures.paint_pca(cloud, context.storage.read(f"{prefix}/preview.png"))
 
-    return _picture(context, request, cloud_id, grid, size, paint, ["pca"])
+    return previews.picture(cloud_id, grid, size, paint, ["pca"])
 
 
 @router.get("/band.png", response_class=Response, responses=PNG)
 def band(
-    context: Context,
     principal: Reader,
-    request: Request,
+    previews: PreviewsDep,
     cloud_id: CloudId,
     b: Annotated[str | None, _band("The band")] = None,
     nm: Annotated[float | None, Query(gt=0, lt=100_000, description="The band nearest to this, instead of b.")] = None,
     low: Low = None,
     high: High = None,
     size: Size = 1024,
-    grid: Where = "cube",
+    grid: GridChoice = "cube",
 ) -> Response:
-    """One band in grey."""
+    """Show one band in grey."""
     if (b is None) == (nm is None):
         raise RequestInvalidError("Which band is not said, or said twice.", advice="Give either b or nm.")
     chosen, limits = b if b is not None else f"{nm:.4f}nm", _limits(low, high)
 
-    def paint(cloud: Cloud) -> Painted:
+    def paint(cloud: Cloud) -> PointColours:
         return pictures.paint_band(cloud, pictures.band_index(cloud, chosen), limits)
 
-    return _picture(context, request, cloud_id, grid, size, paint, ["band", chosen, limits])
+    return previews.picture(cloud_id, grid, size, paint, ["band", chosen, limits])
 
 
 @router.get("/composite.png", response_class=Response, responses=PNG)
 def composite(
-    context: Context,
     principal: Reader,
-    request: Request,
+    previews: PreviewsDep,
     cloud_id: CloudId,
     r: Annotated[str, _band("Band shown in red")] = TRUE_COLOUR[0],
     g: Annotated[str, _band("Band shown in green")] = TRUE_COLOUR[1],
     b: Annotated[str, _band("Band shown in blue")] = TRUE_COLOUR[2],
     size: Size = 1024,
-    grid: Where = "cube",
+    grid: GridChoice = "cube",
 ) -> Response:
-    """Three bands as red, green and blue, each between its 2nd and 98th percentile."""
+    """Show three bands as red, green and blue, each between its 2nd and 98th percentile."""
 
-    def paint(cloud: Cloud) -> Painted:
+    def paint(cloud: Cloud) -> PointColours:
         red, green, blue = (pictures.band_index(cloud, given) for given in (r, g, b))
         return pictures.paint_composite(cloud, (red, green, blue))
 
-    return _picture(context, request, cloud_id, grid, size, paint, ["composite", r, g, b])
+    return previews.picture(cloud_id, grid, size, paint, ["composite", r, g, b])
 
 
 @router.get("/index.png", response_class=Response, responses=PNG)
 def index(
-    context: Context,
     principal: Reader,
-    request: Request,
+    previews: PreviewsDep,
     cloud_id: CloudId,
     a: Annotated[str, _band("First band")],
     b: Annotated[str, _band("Second band")],
     low: Low = None,
     high: High = None,
     size: Size = 1024,
-    grid: Where = "cube",
+    grid: GridChoice = "cube",
 ) -> Response:
-    """The normalised difference (a - b) / (a + b) as a colour scale; transparent where a + b is not positive."""
+    """Show the normalised difference (a - b) / (a + b) as a colour scale; transparent where a + b is not positive."""
     limits = _limits(low, high)
 
-    def paint(cloud: Cloud) -> Painted:
+    def paint(cloud: Cloud) -> PointColours:
         first, second = (pictures.band_index(cloud, given) for given in (a, b))
         return pictures.paint_index(cloud, first, second, limits)
 
-    return _picture(context, request, cloud_id, grid, size, paint, ["index", a, b, limits])
+    return previews.picture(cloud_id, grid, size, paint, ["index", a, b, limits])
 
 
 @router.get("/label.png", response_class=Response, responses=PNG)
 def label(
     context: Context,
     principal: Reader,
-    request: Request,
+    previews: PreviewsDep,
     cloud_id: CloudId,
     name: Annotated[str, Query(pattern=r"^[a-z0-9_-]{1,64}$", description="The layer.")],
     version: Annotated[int | None, Query(ge=1, le=10**9, description="By default the current one.")] = None,
     class_value: Annotated[
         int | None,
-        Query(alias="class", ge=0, le=65535, description="Whose probability; by default the first class's."),
+        Query(alias="class", ge=0, le=65535, description="Class whose probability is shown; by default the first."),
     ] = None,
     low: Low = None,
     high: High = None,
     size: Size = 1024,
-    grid: Where = "cube",
+    grid: GridChoice = "cube",
 ) -> Response:
-    """A label layer over the dimmed photos: classes in their colours, probabilities as a colour scale from 0 to 1."""
+    """Show a label layer over the dimmed photos: classes in their colours, probabilities on a scale from 0 to 1."""
     limits = _limits(low, high)
-    context.clouds.record(cloud_id)
+    previews.clouds.record(cloud_id)
     with context.database.session() as session:
         row = find_label(session, cloud_id, name, version)
     record = LabelRecord(row.name, row.version, row.kind, row.storage_prefix)
@@ -181,8 +231,8 @@ def label(
             classes=known,
         )
 
-    def paint(cloud: Cloud) -> Painted:
-        array = context.clouds.label_array(record)
+    def paint(cloud: Cloud) -> PointColours:
+        array = previews.clouds.label_array(record)
         values = array.read(0, array.shape[0])
         if row.kind == "class":
             return pictures.paint_classes(cloud, values, row.classes)
@@ -190,7 +240,7 @@ def label(
         return pictures.paint_probability(cloud, values.reshape(len(values), -1)[:, column], limits)
 
     parameters = ["label", row.storage_prefix, class_value, limits]
-    return _picture(context, request, cloud_id, grid, size, paint, parameters)
+    return previews.picture(cloud_id, grid, size, paint, parameters)
 
 
 def _limits(low: float | None, high: float | None) -> tuple[float, float] | None:
@@ -199,28 +249,3 @@ def _limits(low: float | None, high: float | None) -> tuple[float, float] | None
     if low is None or high is None or not low < high:
         raise RequestInvalidError("low and high are no range.", advice="Give both, low below high, or neither.")
     return low, high
-
-
-def _picture(
-    context: AppContext, request: Request, cloud_id: str, grid: Grid, size: int, paint: Paint, parameters: list[Any]
-) -> Response:
-    """The answer; ``parameters`` are all that the picture depends on beside cloud, grid and size."""
-    context.clouds.record(cloud_id)
-    # A cloud never changes: what it is drawn from, and by which program, says which picture it is.
-    told = json_text([__version__, cloud_id, grid, size, *parameters])
-    tag = hashlib.sha256(told.encode()).hexdigest()[:32]
-    headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache", "Vary": "Authorization"}
-    known = [part.strip().removeprefix("W/") for part in request.headers.get("if-none-match", "").split(",")]
-    if f'"{tag}"' in known or "*" in known:
-        return Response(status_code=304, headers=headers)
-
-    def draw() -> Picture:
-        with context.clouds.reading(cloud_id) as (_, cloud):
-            return pictures.draw(cloud, paint(cloud), grid, size)
-
-    picture = context.pictures.get(tag, draw)
-    if picture.range is not None:
-        headers["X-Specimap-Range"] = ",".join(f"{value:.6g}" for value in picture.range)
-    if picture.extent_mm is not None:
-        headers["X-Specimap-Extent-Mm"] = ",".join(f"{value:.4f}" for value in picture.extent_mm)
-    return Response(picture.png, headers=headers, media_type="image/png")

@@ -1,4 +1,4 @@
-"""``/v1/clouds``: what results there are."""
+"""``/v1/clouds``: the finished results."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from specimap_infra.tables import Acquisition, CloudRow, Job
-from specimap_service.auth.keys import Reader
+from specimap_service.auth.dependencies import Reader
 from specimap_service.byte_ranges import ranged_response
+from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import Context
 from specimap_service.paging import After, Limit, Page, page_of
 
@@ -35,11 +36,11 @@ class CloudSummary(BaseModel):
 
 
 class CloudAnswer(CloudSummary):
-    """A finished cloud, with what its arrays' metadata say and where the rest is."""
+    """A finished cloud with the metadata of its arrays, and links to everything else."""
 
-    quantity: str = Field(description="What decoded spectra are: `reflectance`, or `counts`.")
-    wavelength_nm: list[float | None] = Field(description="One a band; null where unknown.")
-    bad_bands: list[int] = Field(description="Bands that the cube's file or its noise declared useless.")
+    quantity: str = Field(description="Quantity of decoded spectra: `reflectance`, or `counts`.")
+    wavelength_nm: list[float | None] = Field(description="One for each band; null where unknown.")
+    bad_bands: list[int] = Field(description="Bands that are useless according to the cube's file or its noise.")
     low: list[float] = Field(description="Least x, y, z of the points, mm, marker frame.")
     high: list[float]
     labels: list[str]
@@ -55,7 +56,7 @@ def list_clouds(
     after: After = None,
     limit: Limit = 100,
 ) -> Page[CloudSummary]:
-    """All finished clouds, newest first."""
+    """List finished clouds, newest first."""
     query = sa.select(CloudRow).join(Job, Job.id == CloudRow.job_id).where(Job.state == "succeeded")
     if acquisition_id is not None:
         query = query.where(CloudRow.acquisition_id == acquisition_id)
@@ -71,9 +72,9 @@ def list_clouds(
 
 
 @router.get("/clouds/{cloud_id}")
-def show_cloud(context: Context, principal: Reader, cloud_id: CloudId) -> CloudAnswer:
-    """One cloud."""
-    with context.clouds.reading(cloud_id) as (record, cloud):
+def show_cloud(principal: Reader, clouds: CloudsDep, cloud_id: CloudId) -> CloudAnswer:
+    """Return one cloud."""
+    with clouds.reading(cloud_id) as (record, cloud):
         boxes, here = cloud.chunk_aabb, f"/v1/clouds/{cloud_id}"
         return CloudAnswer(
             **CloudSummary.model_validate(record).model_dump(),
@@ -99,7 +100,9 @@ def show_cloud(context: Context, principal: Reader, cloud_id: CloudId) -> CloudA
 @router.get(
     "/clouds/{cloud_id}/corners", response_class=Response, responses={200: {"content": {"application/json": {}}}}
 )
-def get_corners(context: Context, principal: Reader, request: Request, cloud_id: CloudId) -> Response:
-    """The markers' corners: `{"<id>": [[x, y, z] * 4]}`, mm, in the marker frame."""
-    record = context.clouds.record(cloud_id)
+def get_corners(
+    context: Context, principal: Reader, clouds: CloudsDep, request: Request, cloud_id: CloudId
+) -> Response:
+    """Return the markers' corners: `{"<id>": [[x, y, z] * 4]}`, mm, in the marker frame."""
+    record = clouds.record(cloud_id)
     return ranged_response(request, context.storage, f"{record.prefix}/corners.json", "application/json")

@@ -1,4 +1,4 @@
-"""Which points and bands a request means, and what is told of them."""
+"""Selection of points and bands by a request, and their values."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MOST_POINTS = 100_000
 """Points of one page."""
 MOST_JSON_POINTS = 10_000
 PAGE, JSON_PAGE = 10_000, 2_000
-"""Points of a page where the request does not say."""
+"""Points of a page where the request gives no limit."""
 MOST_VERTICES = 10_000
 
 FieldName = Literal["xyz", "normal", "rgb", "hsi_pixel", "sigma_mm", "flags", "distance_mm"]
@@ -70,7 +70,7 @@ class Radius(_Strict):
 
 
 class Select(_OneOf):
-    """Which points: exactly one of these."""
+    """A selection of points: exactly one of these."""
 
     indices: list[_Number] | None = Field(
         default=None,
@@ -99,7 +99,7 @@ class Select(_OneOf):
 
 
 class Bands(_OneOf):
-    """Which bands: exactly one of these."""
+    """A selection of bands: exactly one of these."""
 
     nm: tuple[FiniteFloat, FiniteFloat] | None = Field(
         default=None, description="Bands from the first to the second wavelength, both included."
@@ -110,7 +110,7 @@ class Bands(_OneOf):
 
 
 class SpectraRequest(_Strict):
-    """Points, bands, and what else is wanted of the points."""
+    """Points, bands, and further columns of the points."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -128,7 +128,7 @@ class SpectraRequest(_Strict):
     fields: list[FieldName] = Field(
         default_factory=list,
         max_length=7,
-        description="Columns beside index and spectrum; `distance_mm` goes with `nearest` and `radius`.",
+        description="Columns in addition to index and spectrum; `distance_mm` goes with `nearest` and `radius`.",
     )
     limit: int | None = Field(
         default=None,
@@ -136,22 +136,22 @@ class SpectraRequest(_Strict):
         le=MOST_POINTS,
         description=f"Most points; {PAGE} where absent, in JSON {JSON_PAGE} and never more than {MOST_JSON_POINTS}.",
     )
-    offset: int = Field(default=0, ge=0, le=2**32, description="Points of the selection to leave out before.")
+    offset: int = Field(default=0, ge=0, le=2**32, description="Points of the selection to skip at its start.")
 
     @model_validator(mode="after")
-    def _measurable(self) -> Self:
+    def _has_centre(self) -> Self:
         if "distance_mm" in self.fields and self.select.nearest is None and self.select.radius is None:
             raise ValueError("distance_mm goes with the selections nearest and radius")
         return self
 
 
 class SpectraAnswer(BaseModel):
-    """One page of a selection. ``indices``, ``spectra`` and ``fields`` have one entry a point."""
+    """One page of a selection. ``indices``, ``spectra`` and ``fields`` have one entry for each point."""
 
     total: int = Field(description="Points of the whole selection.")
     offset: int
     next_offset: int | None = Field(description="`offset` of the next page; null on the last one.")
-    quantity: str = Field(description="What the values are: `reflectance`, or `counts`.")
+    quantity: str = Field(description="Quantity of the values: `reflectance`, or `counts`.")
     bands: list[int]
     wavelength_nm: list[float | None]
     indices: list[int]
@@ -160,7 +160,7 @@ class SpectraAnswer(BaseModel):
 
 
 class Point(BaseModel):
-    """All that is known of one point."""
+    """All values of one point."""
 
     index: int
     xyz: list[float] = Field(description="mm, marker frame.")
@@ -170,8 +170,8 @@ class Point(BaseModel):
     sigma_mm: float | None = Field(description="One standard deviation of the position.")
     flags: int
     flag_names: list[str]
-    labels: dict[str, float | int | list[float | None] | None] = Field(description="By label: its value here.")
-    quantity: str = Field(description="What the spectrum is: `reflectance`, or `counts`.")
+    labels: dict[str, float | int | list[float | None] | None] = Field(description="Value of each label at this point.")
+    quantity: str = Field(description="Quantity of the spectrum: `reflectance`, or `counts`.")
     bands: list[int]
     wavelength_nm: list[float | None]
     spectrum: list[float | None] = Field(description="Null where it has no value.")
@@ -186,7 +186,7 @@ class BandAnswer(BaseModel):
     values: list[float | None] = Field(description="Null where a point has no value; NaN in Arrow and NumPy.")
 
 
-# ---- what a request means -----------------------------------------------------------------------------
+# ---- selection ----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -198,13 +198,13 @@ class Selection:
 
 
 def selected(cloud: Cloud, select: Select) -> Selection:
-    """The points that are meant.
+    """Find the selected points.
 
     Raises:
         RequestInvalidError: there is no such point.
     """
     if select.indices is not None:
-        return Selection(_inside(select.indices, cloud.n_points, "point"))
+        return Selection(_checked_numbers(select.indices, cloud.n_points, "point"))
     if select.pixels is not None:
         found = cloud.at_pixels(np.array(select.pixels))
         return Selection(found[found >= 0])
@@ -219,7 +219,7 @@ def selected(cloud: Cloud, select: Select) -> Selection:
 
 
 def band_numbers(cloud: Cloud, bands: Bands | None) -> NDArray[np.intp] | None:
-    """The bands that are meant; None for all.
+    """Find the selected bands; None stands for all.
 
     Raises:
         RequestInvalidError: there is no such band.
@@ -227,7 +227,7 @@ def band_numbers(cloud: Cloud, bands: Bands | None) -> NDArray[np.intp] | None:
     if bands is None:
         return None
     if bands.indices is not None:
-        return _inside(bands.indices, cloud.bands, "band")
+        return _checked_numbers(bands.indices, cloud.bands, "band")
     assert bands.nm is not None
     low, high = bands.nm
     # Unknown wavelengths are NaN, which lies in no range.
@@ -243,7 +243,7 @@ def band_numbers(cloud: Cloud, bands: Bands | None) -> NDArray[np.intp] | None:
 
 
 def listed_bands(text: str | None) -> Bands | None:
-    """Bands from the query: ``0,5,10-20``. Its form has been checked."""
+    """Parse bands from the query: ``0,5,10-20``, the form of which has been checked."""
     if text is None:
         return None
     numbers: list[int] = []
@@ -258,7 +258,7 @@ def listed_bands(text: str | None) -> Bands | None:
     return Bands(indices=numbers)
 
 
-def _inside(numbers: list[int], limit: int, what: str) -> NDArray[np.intp]:
+def _checked_numbers(numbers: list[int], limit: int, what: str) -> NDArray[np.intp]:
     found = np.array(numbers, np.intp)
     if found.max() >= limit:
         raise RequestInvalidError(
@@ -269,11 +269,11 @@ def _inside(numbers: list[int], limit: int, what: str) -> NDArray[np.intp]:
     return found
 
 
-# ---- what is told -------------------------------------------------------------------------------------
+# ---- values -------------------------------------------------------------------------------------------
 
 
 def field_values(cloud: Cloud, selection: Selection, name: FieldName, part: slice) -> Array:
-    """Values (n,) or (n, m) of a field for a part of the selected points."""
+    """Return values (n,) or (n, m) of a field for a part of the selected points."""
     points = selection.indices[part]
     if name != "distance_mm":
         return np.asarray(getattr(cloud, name)[points])
@@ -283,7 +283,7 @@ def field_values(cloud: Cloud, selection: Selection, name: FieldName, part: slic
 def columns_of(
     cloud: Cloud, selection: Selection, bands: NDArray[np.intp] | None, fields: list[FieldName], part: slice
 ) -> Columns:
-    """Columns of an Arrow stream: index, the fields, spectrum."""
+    """Return the columns of an Arrow stream: index, the fields, spectrum."""
     points = selection.indices[part]
     return {
         "index": points.astype(np.uint32),
@@ -293,5 +293,5 @@ def columns_of(
 
 
 def flag_names(flags: int) -> list[str]:
-    """Names of the bits that are set."""
+    """Return the names of the bits that are set."""
     return [flag.name.lower() for flag in Flag if flag.name and flags & flag]

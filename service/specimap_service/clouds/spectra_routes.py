@@ -1,4 +1,4 @@
-"""Spectra of points, by number, by place or by pixel; and single bands of all points."""
+"""Spectra of points, selected by number, position or pixel; and single bands of all points."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ from specimap_service.array_responses import (
     NPY,
     arrow_answer,
     chosen_type,
-    documented,
+    documented_responses,
     json_answer,
     npy_answer,
 )
-from specimap_service.auth.keys import Reader
+from specimap_service.auth.dependencies import Reader
+from specimap_service.body_limits import parsed
 from specimap_service.byte_ranges import CACHED, known_to_client
+from specimap_service.clouds.dependencies import CloudsDep, ParsingDep
 from specimap_service.clouds.open_clouds import CloudRecord
 from specimap_service.clouds.routes import CloudId
 from specimap_service.clouds.spectra import (
@@ -41,8 +43,6 @@ from specimap_service.clouds.spectra import (
     listed_bands,
     selected,
 )
-from specimap_service.context import Context
-from specimap_service.json_limit import parsed
 
 router = APIRouter(prefix="/v1", tags=["spectra"])
 BandList = Annotated[
@@ -54,10 +54,10 @@ Number = Annotated[int, Path(ge=0, lt=2**32)]
 
 @router.get("/clouds/{cloud_id}/points/{index}", response_model=Point)
 def show_point(
-    context: Context, principal: Reader, cloud_id: CloudId, index: Number, bands: BandList = None
+    principal: Reader, clouds: CloudsDep, cloud_id: CloudId, index: Number, bands: BandList = None
 ) -> Response:
-    """One point: place, colour, flags, labels, spectrum."""
-    with context.clouds.reading(cloud_id) as (record, cloud):
+    """Return one point: position, colour, flags, labels, spectrum."""
+    with clouds.reading(cloud_id) as (record, cloud):
         if index >= cloud.n_points:
             raise NotFoundError(
                 f"There is no point {index}: the cloud has {cloud.n_points}.",
@@ -76,8 +76,7 @@ def show_point(
                 "flags": flags,
                 "flag_names": flag_names(flags),
                 "labels": {
-                    name: context.clouds.label_array(label).read(index, index + 1)[0]
-                    for name, label in record.labels.items()
+                    name: clouds.label_array(label).read(index, index + 1)[0] for name, label in record.labels.items()
                 },
                 **_described(cloud, numbers),
                 "spectrum": cloud.spectra([index], numbers)[0],
@@ -93,29 +92,32 @@ BODY: dict[str, Any] = {
 }
 
 
-async def _wanted(request: Request) -> SpectraRequest:
-    return await parsed(request, SpectraRequest)
+async def _wanted(request: Request, limiter: ParsingDep) -> SpectraRequest:
+    return await parsed(request, SpectraRequest, limiter)
 
 
 @router.post(
-    "/clouds/{cloud_id}/spectra", response_model=SpectraAnswer, responses=documented(SpectraAnswer), openapi_extra=BODY
+    "/clouds/{cloud_id}/spectra",
+    response_model=SpectraAnswer,
+    responses=documented_responses(SpectraAnswer),
+    openapi_extra=BODY,
 )
 def read_spectra(
-    context: Context,
     principal: Reader,
+    clouds: CloudsDep,
     request: Request,
     cloud_id: CloudId,
     wanted: Annotated[SpectraRequest, Depends(_wanted)],
 ) -> Response:
-    """Spectra of the points selected, a page at a time.
+    """Return spectra of the selected points, a page at a time.
 
-    Arrow: columns `index`, the fields asked for, `spectrum`; total, quantity, bands and wavelengths in the schema's
+    Arrow: columns `index`, the requested fields, `spectrum`; total, quantity, bands and wavelengths in the schema's
     metadata. NumPy: the spectra alone, float32 (points, bands). `X-Specimap-Total` counts the whole selection,
-    `X-Specimap-Next-Offset` is there where a further page is.
+    `X-Specimap-Next-Offset` is present if there is another page.
     """
     media = chosen_type(request)
     limit = min(wanted.limit or JSON_PAGE, MOST_JSON_POINTS) if media == JSON else wanted.limit or PAGE
-    with context.clouds.reading(cloud_id) as (record, cloud):
+    with clouds.reading(cloud_id) as (record, cloud):
         numbers, selection = band_numbers(cloud, wanted.bands), selected(cloud, wanted.select)
         total, start = len(selection.indices), wanted.offset
         stop = min(start + limit, total)
@@ -152,11 +154,11 @@ def read_spectra(
         )
 
 
-@router.get("/clouds/{cloud_id}/bands/{band}", response_model=BandAnswer, responses=documented(BandAnswer))
-def read_band(context: Context, principal: Reader, request: Request, cloud_id: CloudId, band: Number) -> Response:
-    """One band of all points, in their order. Arrow: column `value`; NumPy: float32 (points,)."""
+@router.get("/clouds/{cloud_id}/bands/{band}", response_model=BandAnswer, responses=documented_responses(BandAnswer))
+def read_band(principal: Reader, clouds: CloudsDep, request: Request, cloud_id: CloudId, band: Number) -> Response:
+    """Return one band of all points, in their order. Arrow: column `value`; NumPy: float32 (points,)."""
     media = chosen_type(request)
-    with context.clouds.reading(cloud_id) as (record, cloud):
+    with clouds.reading(cloud_id) as (record, cloud):
         if band >= cloud.bands:
             raise NotFoundError(
                 f"There is no band {band}: the cloud has {cloud.bands}.",

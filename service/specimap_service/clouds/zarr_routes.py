@@ -14,8 +14,9 @@ from specimap_core.cloud.source import ByteSource
 from specimap_core.errors import NotFoundError
 from specimap_core.json_text import json_text
 from specimap_infra.storage import Storage
-from specimap_service.auth.keys import Reader
+from specimap_service.auth.dependencies import Reader
 from specimap_service.byte_ranges import CACHED, REVALIDATED, ranged_bytes, ranged_response
+from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.clouds.open_clouds import CloudRecord, StoredFolder
 from specimap_service.clouds.routes import CloudId
 from specimap_service.context import Context
@@ -28,7 +29,7 @@ _FILE = {"schema": {"type": "string", "format": "binary"}}
 _ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {"description": "The file", "content": {BYTES: _FILE, JSON: {"schema": {"type": "object"}}}},
     206: {"description": "The byte range", "content": {BYTES: _FILE}},
-    304: {"description": "The client has it"},
+    304: {"description": "The client has the current file"},
 }
 
 
@@ -39,22 +40,23 @@ _ANSWERS: dict[int | str, dict[str, Any]] = {
 def zarr_file(
     context: Context,
     principal: Reader,
+    clouds: CloudsDep,
     request: Request,
     cloud_id: CloudId,
     key: Annotated[str, Path(description="As in the group: `zarr.json`, `spectra/c/0/0`, `labels/tissue/zarr.json`.")],
 ) -> Response:
-    """A file of the group, as stored; single byte ranges, ETags.
+    """Return a file of the group, as stored; with single byte ranges and ETags.
 
-    Two documents are made when asked for, so that clients find the arrays without listing files: `zarr.json` with
-    consolidated metadata, the labels among them, and `labels/zarr.json` with those of the labels. Labels appear as
+    Two documents are made on request, so that clients find the arrays without listing files: `zarr.json` with
+    consolidated metadata, also of the labels, and `labels/zarr.json` with those of the labels. Labels appear as
     `labels/<name>`, in their current version.
     """
-    record = context.clouds.record(cloud_id)
-    # Every key is made of characters that need no escape: what comes escaped is none, whatever it decodes to.
+    record = clouds.record(cloud_id)
+    # Every key is made of characters that need no escape: an escaped one does not exist, whatever it decodes to.
     if b"%" in request.scope.get("raw_path", b""):
-        raise _no_such(key)
+        raise _no_file(key)
     if key in (DOCUMENT, f"labels/{DOCUMENT}"):
-        with context.clouds.reading(cloud_id) as (record, _):
+        with clouds.reading(cloud_id) as (record, _):
             return ranged_bytes(request, _group_document(context.storage, record, labels=key != DOCUMENT), JSON)
     array, _, rest = key.partition("/")
     if array == "labels":
@@ -64,26 +66,26 @@ def zarr_file(
     else:
         folder, cache = f"{record.zarr}/{array}" if array in ARRAYS else None, CACHED
     if folder is None or not rest:
-        raise _no_such(key)
+        raise _no_file(key)
     try:
         return ranged_response(
             request, context.storage, f"{folder}/{rest}", JSON if rest == DOCUMENT else BYTES, cache=cache
         )
     except NotFoundError as error:
-        # What the storage says of it names where the file would be.
-        raise _no_such(key) from error
+        # The storage's own message names the place of the file.
+        raise _no_file(key) from error
 
 
-def _no_such(key: str) -> NotFoundError:
+def _no_file(key: str) -> NotFoundError:
     return NotFoundError(f"There is no file {key[:200]!r} in the cloud.", advice="zarr.json lists the arrays.")
 
 
 def _group_document(storage: Storage, record: CloudRecord, *, labels: bool) -> bytes:
-    """``zarr.json`` of the cloud's group, or of the group of its labels, with consolidated metadata."""
+    """Make ``zarr.json`` of the cloud's group, or of the group of its labels, with consolidated metadata."""
     own = {name: _document(StoredFolder(storage, label.prefix), DOCUMENT) for name, label in record.labels.items()}
     if labels:
         if not own:
-            raise _no_such(f"labels/{DOCUMENT}")
+            raise _no_file(f"labels/{DOCUMENT}")
         document, members = dict(GROUP), own
     else:
         source = StoredFolder(storage, record.zarr)

@@ -1,1 +1,1 @@
-"""Jobs: submitted, followed, ended."""
+"""Jobs: submitted, followed, cancelled, deleted."""

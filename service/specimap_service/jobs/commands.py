@@ -1,4 +1,4 @@
-"""Jobs made and removed: the row, its first event and the engine's workflow together or not at all."""
+"""Create and delete jobs: the row, its first event and the engine's workflow together or not at all."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ from specimap_infra.logs import logger
 from specimap_infra.queue import JOBS, RUN_JOB, enqueue
 from specimap_infra.tables import FINAL_STATES, PRIORITIES, Acquisition, Job
 from specimap_infra.webhooks import check_target
-from specimap_service.acquisitions.deletion import Leftovers
+from specimap_service.clouds.open_clouds import OpenClouds
 from specimap_service.context import AppContext, audit, correlation_id
 from specimap_service.errors import IdempotencyConflictError, UploadIncompleteError
+from specimap_service.jobs.deletion import JobFiles
 from specimap_service.jobs.schemas import JobRequest, RerunRequest, Webhook
 
 
 def new_job(context: AppContext, key_id: str, wanted: JobRequest, idempotency_key: str | None) -> tuple[JobView, bool]:
-    """A job on an acquisition, and whether it was made now.
+    """Create a job on an acquisition; return it, and whether it is new.
 
     Raises:
         NotFoundError: there is no such acquisition.
@@ -43,16 +44,21 @@ def new_job(context: AppContext, key_id: str, wanted: JobRequest, idempotency_ke
             acquisition_id=acquisition.id,
             settings=wanted.settings.on(acquisition),
             priority=PRIORITIES[wanted.priority],
-            webhook=_checked(context, wanted.webhook),
+            webhook=_checked_webhook(context, wanted.webhook),
         )
 
-    return _made_once(context, key_id, idempotency_key, wanted.digest(), row)
+    return _create_once(context, key_id, idempotency_key, wanted.digest(), row)
 
 
 def repeated_job(
     context: AppContext, key_id: str, job_id: str, wanted: RerunRequest, idempotency_key: str | None
 ) -> tuple[JobView, bool]:
-    """A job as an earlier one was, but for what is given, and whether it was made now. Raises as `new_job`."""
+    """Create a job with an earlier one's settings, but for those given; return it, and whether it is new.
+
+    Raises:
+        NotFoundError: there is no such job.
+        UploadIncompleteError, SettingsError, IdempotencyConflictError: as for :func:`new_job`.
+    """
 
     def row(session: Session) -> Job:
         earlier = found_job(session, job_id)
@@ -64,36 +70,36 @@ def repeated_job(
             acquisition_id=earlier.acquisition_id,
             settings=job_settings({**earlier.settings, **changed}).model_dump(),
             priority=PRIORITIES[wanted.priority] if wanted.priority else earlier.priority,
-            webhook=_checked(context, webhook),
+            webhook=_checked_webhook(context, webhook),
             rerun_of=earlier.id,
         )
 
-    return _made_once(context, key_id, idempotency_key, wanted.digest(job_id), row)
+    return _create_once(context, key_id, idempotency_key, wanted.digest(job_id), row)
 
 
 def found_job(session: Session, job_id: str) -> Job:
-    """The job's row. Raises NotFoundError."""
+    """Return the job's row. Raises NotFoundError."""
     job = session.get(Job, job_id)
     if job is None:
         raise NotFoundError(f"There is no job {job_id}.", advice="Check the id; it may have been deleted.")
     return job
 
 
-def _made_once(
+def _create_once(
     context: AppContext, key_id: str, idempotency_key: str | None, digest: str, row: Callable[[Session], Job]
 ) -> tuple[JobView, bool]:
-    earlier = _earlier(context, key_id, idempotency_key, digest)
+    earlier = _find_repeated(context, key_id, idempotency_key, digest)
     if earlier is not None:
         return earlier, False
     try:
         with context.database.session() as session:
             job = row(session)
-            lacking = missing(session, job.acquisition_id)
-            if lacking:
+            missing_files = missing(session, job.acquisition_id)
+            if missing_files:
                 raise UploadIncompleteError(
-                    f"Acquisition {job.acquisition_id} is not complete: {lacking[0]}",
+                    f"Acquisition {job.acquisition_id} is not complete: {missing_files[0]}",
                     advice="Upload what is missing, then ask again.",
-                    missing=lacking,
+                    missing=missing_files,
                 )
             job.id, job.state, job.created_by = new_id("job"), "queued", key_id
             job.idempotency_key, job.request_hash, job.correlation_id = idempotency_key, digest, correlation_id()
@@ -106,14 +112,14 @@ def _made_once(
             (view,) = job_views(session, [job])
             return view, True
     except IntegrityError as error:
-        # The same request came twice at once, or the acquisition was deleted meanwhile.
-        earlier = _earlier(context, key_id, idempotency_key, digest)
+        # The same request was made twice at once, or the acquisition was deleted.
+        earlier = _find_repeated(context, key_id, idempotency_key, digest)
         if earlier is None:
             raise _no_acquisition(job.acquisition_id) from error
         return earlier, False
 
 
-def _earlier(context: AppContext, key_id: str, idempotency_key: str | None, digest: str) -> JobView | None:
+def _find_repeated(context: AppContext, key_id: str, idempotency_key: str | None, digest: str) -> JobView | None:
     if idempotency_key is None:
         return None
     with context.database.session() as session:
@@ -129,7 +135,7 @@ def _earlier(context: AppContext, key_id: str, idempotency_key: str | None, dige
         return job_views(session, [job])[0]
 
 
-def _checked(context: AppContext, webhook: Webhook | None) -> dict[str, str] | None:
+def _checked_webhook(context: AppContext, webhook: Webhook | None) -> dict[str, str] | None:
     if webhook is None:
         return None
     check_target(webhook.url, context.settings)
@@ -140,16 +146,16 @@ def _no_acquisition(acquisition_id: str) -> NotFoundError:
     return NotFoundError(f"There is no acquisition {acquisition_id}.", advice="Check the id; it may have been deleted.")
 
 
-# ---- ends ---------------------------------------------------------------------------------------------
+# ---- cancelling and deleting --------------------------------------------------------------------------
 
 
 def stop_workflow(context: AppContext, job_id: str) -> None:
-    """Tell the engine that a job was cancelled. Where it cannot be told, the worker learns from the job's row."""
-    _tell_engine(context.queue.cancel_workflow, job_id)
+    """Cancel a job's workflow at the engine. Where that fails, the worker learns of it from the job's row."""
+    _call_engine(context.queue.cancel_workflow, job_id)
 
 
-def delete_job(context: AppContext, key_id: str, job_id: str) -> None:
-    """Remove a job that has ended, its result, and all their files.
+def delete_job(context: AppContext, clouds: OpenClouds, key_id: str, job_id: str) -> None:
+    """Delete a job that has ended, its result, and all their files.
 
     Raises:
         NotFoundError: there is no such job.
@@ -160,15 +166,15 @@ def delete_job(context: AppContext, key_id: str, job_id: str) -> None:
         job = locked(session, job_id) or found_job(session, job_id)
         if job.state not in FINAL_STATES:
             raise JobConflictError(f"Job {job_id} is {job.state}.", advice="Cancel it first.", state=job.state)
-        acquisition, leftovers = job.acquisition_id, Leftovers.of(session, [job_id])
+        acquisition, files = job.acquisition_id, JobFiles.of(session, [job_id])
         session.execute(sa.delete(Job).where(Job.id == job_id))
         audit(session, key_id, "job.delete", job_id, acquisition=acquisition)
-    _tell_engine(context.queue.delete_workflow, job_id)
-    leftovers.remove(context)
+    _call_engine(context.queue.delete_workflow, job_id)
+    files.remove(context.storage, clouds)
 
 
-def _tell_engine(call: Callable[[str], None], job_id: str) -> None:
+def _call_engine(call: Callable[[str], None], job_id: str) -> None:
     try:
         call(job_id)
     except (SQLAlchemyError, dbos_error.DBOSException) as error:
-        logger().warning("the job engine could not be told", job=job_id, error=type(error).__name__)
+        logger().warning("a call to the job engine failed", job=job_id, error=type(error).__name__)

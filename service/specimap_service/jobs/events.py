@@ -1,4 +1,4 @@
-"""Jobs' events to many listeners: one look into the database for all of them, however many there are."""
+"""Events of jobs for many listeners, with one query to the database for all of them."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from specimap_infra.tables import FINAL_STATES, Job, JobEvent
 
 POLL_SECONDS = 0.25
 KEEP_ALIVE_SECONDS = 15.0
-AWAY_SECONDS = 1.0
-"""How long to wait before a database that did not answer is asked again."""
+RETRY_SECONDS = 1.0
+"""How long to wait before a database that did not answer is queried again."""
 PAGE = 500
 KEPT = 512
-"""Events of a job that are kept for its listeners; whoever is further behind reads the database."""
+"""Events of a job that are kept for its listeners; a listener further behind reads the database."""
 
 
 @dataclass(frozen=True)
@@ -35,28 +35,28 @@ class Event:
 
     @property
     def final(self) -> bool:
-        """Whether nothing comes after it."""
+        """Whether no event comes after it."""
         return self.type == "state" and self.data["state"] in FINAL_STATES
 
 
 @dataclass
 class _Channel:
-    """A job that is listened to: its newest events, and who waits for more."""
+    """A job with listeners: its newest events, and a signal when there are more."""
 
     head: int
     recent: deque[Event] = field(default_factory=lambda: deque(maxlen=KEPT))
     listeners: int = 0
-    news: asyncio.Event = field(default_factory=asyncio.Event)
+    changed: asyncio.Event = field(default_factory=asyncio.Event)
 
     def add(self, events: list[Event]) -> None:
         self.recent.extend(events)
         self.head = events[-1].seq
         # Each waiter holds the old event; the next ones wait for the new.
-        self.news.set()
-        self.news = asyncio.Event()
+        self.changed.set()
+        self.changed = asyncio.Event()
 
     def after(self, seq: int) -> list[Event] | None:
-        """Events after ``seq``; None where they are not kept any more."""
+        """Return the events after ``seq``; None where they are no longer kept."""
         if seq >= self.head:
             return []
         if not self.recent or self.recent[0].seq > seq + 1:
@@ -74,21 +74,21 @@ class JobEvents:
         self._joined = asyncio.Event()
 
     async def follow(self, job_id: str, after: int) -> AsyncIterator[Event | None]:
-        """Events after number ``after``, as they come; None now and then where nothing happens.
+        """Yield events after number ``after`` as they occur, and None now and then while nothing happens.
 
-        Ends after the final event, and where the job is deleted. Goes on when the database was away.
+        Ends after the final event, or when the job is deleted. Waits while the database is unavailable.
         """
         with self._listening(job_id, after) as channel:
             seq = after
             while True:
-                news = channel.news
+                changed = channel.changed
                 events = channel.after(seq)
                 if events is None:
                     try:
                         found = await asyncio.to_thread(read_events, self._database, {job_id: seq})
                     except DatabaseUnavailableError:
                         yield None
-                        await asyncio.sleep(AWAY_SECONDS)
+                        await asyncio.sleep(RETRY_SECONDS)
                         continue
                     events = found.get(job_id, [])
                 for event in events:
@@ -99,9 +99,9 @@ class JobEvents:
                 if events:
                     continue
                 try:
-                    await asyncio.wait_for(news.wait(), KEEP_ALIVE_SECONDS)
+                    await asyncio.wait_for(changed.wait(), KEEP_ALIVE_SECONDS)
                 except TimeoutError:
-                    if not await self._alive(job_id):
+                    if not await self._exists(job_id):
                         return
                     yield None
 
@@ -129,38 +129,38 @@ class JobEvents:
             try:
                 found = await asyncio.to_thread(read_events, self._database, heads)
             except DatabaseUnavailableError:
-                wait = AWAY_SECONDS
+                wait = RETRY_SECONDS
             except Exception:
-                # Whatever it was, the listeners of all jobs hang on this task.
+                # Whatever the error, the listeners of all jobs depend on this task.
                 logger().exception("reading of job events failed")
-                wait = AWAY_SECONDS
+                wait = RETRY_SECONDS
             for job_id, events in found.items():
                 channel = self._channels.get(job_id)
-                # A channel that was closed and opened again meanwhile may stand elsewhere.
+                # A channel that was closed and opened again meanwhile may be at another event.
                 if channel is not None and channel.head == heads[job_id]:
                     channel.add(events)
             if sum(map(len, found.values())) < PAGE:
                 await self._wait(wait)
 
     async def _wait(self, seconds: float) -> None:
-        """Wait, but no longer than until a job is listened to that was not before."""
+        """Wait, but only until a job gets its first listener."""
         self._joined.clear()
         with suppress(TimeoutError):
             await asyncio.wait_for(self._joined.wait(), seconds)
 
-    async def _alive(self, job_id: str) -> bool:
-        def look() -> bool:
+    async def _exists(self, job_id: str) -> bool:
+        def find() -> bool:
             with self._database.session() as session:
                 return session.get(Job, job_id) is not None
 
         try:
-            return await asyncio.to_thread(look)
+            return await asyncio.to_thread(find)
         except DatabaseUnavailableError:
             return True
 
 
 def read_events(database: Database, after: dict[str, int]) -> dict[str, list[Event]]:
-    """The next events of each job after a number, at most 500 in all; jobs without any are left out.
+    """Return the next events of each job after a number, at most 500 in all; jobs without any are left out.
 
     Raises:
         DatabaseUnavailableError: the database cannot be reached.

@@ -1,4 +1,4 @@
-"""Jobs: made, watched, cancelled, repeated, deleted."""
+"""Jobs: created, followed, cancelled, repeated, deleted."""
 
 from __future__ import annotations
 
@@ -17,9 +17,12 @@ from specimap_infra.errors import JobConflictError
 from specimap_infra.job_schemas import JobState, JobView, job_views
 from specimap_infra.jobs import locked, request_cancel
 from specimap_infra.tables import FINAL_STATES, CloudRow, Job, JobEvent
-from specimap_service.auth.keys import Admin, Reader, Uploader
+from specimap_service.auth.dependencies import Admin, Reader, Uploader
+from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import AppContext, Context, audit
 from specimap_service.jobs.commands import delete_job, found_job, new_job, repeated_job, stop_workflow
+from specimap_service.jobs.dependencies import EventsDep
+from specimap_service.jobs.events import JobEvents
 from specimap_service.jobs.schemas import (
     AfterJob,
     AfterSeq,
@@ -34,10 +37,12 @@ from specimap_service.paging import Limit, Moment, Page, page_of
 
 router = APIRouter(prefix="/v1", tags=["jobs"])
 
-AGAIN: dict[int | str, dict[str, Any]] = {200: {"model": JobView, "description": "Made before by the same request"}}
+REPEATED: dict[int | str, dict[str, Any]] = {
+    200: {"model": JobView, "description": "Created before by the same request"}
+}
 
 
-@router.post("/jobs", status_code=202, responses=AGAIN)
+@router.post("/jobs", status_code=202, responses=REPEATED)
 def create_job(
     context: Context,
     principal: Uploader,
@@ -45,11 +50,11 @@ def create_job(
     wanted: JobRequest,
     idempotency_key: IdempotencyKey = None,
 ) -> JobView:
-    """Queue a job on an acquisition that is complete."""
+    """Queue a job on a complete acquisition."""
     return _answer(response, *new_job(context, principal.key_id, wanted, idempotency_key))
 
 
-@router.post("/jobs/{job_id}/rerun", status_code=202, responses=AGAIN)
+@router.post("/jobs/{job_id}/rerun", status_code=202, responses=REPEATED)
 def rerun_job(
     context: Context,
     principal: Uploader,
@@ -58,7 +63,7 @@ def rerun_job(
     wanted: RerunRequest | None = None,
     idempotency_key: IdempotencyKey = None,
 ) -> JobView:
-    """Queue a job as this one was, with other settings; stages that these do not change are not repeated."""
+    """Queue this job again with other settings; stages that they do not change are not repeated."""
     return _answer(
         response, *repeated_job(context, principal.key_id, job_id, wanted or RerunRequest(), idempotency_key)
     )
@@ -81,7 +86,7 @@ def list_jobs(
     after: AfterJob = None,
     limit: Limit = 100,
 ) -> Page[JobView]:
-    """Jobs, newest first."""
+    """List jobs, newest first."""
     query = sa.select(Job).order_by(Job.id.desc()).limit(limit + 1)
     if acquisition_id is not None:
         query = query.where(Job.acquisition_id == acquisition_id)
@@ -100,33 +105,33 @@ def list_jobs(
 
 @router.get("/jobs/{job_id}")
 def get_job(context: Context, principal: Reader, job_id: JobId) -> JobView:
-    """A job as it is now."""
+    """Return a job as it is now."""
     with context.database.session() as session:
         return job_views(session, [found_job(session, job_id)])[0]
 
 
 @router.post("/jobs/{job_id}/cancel", status_code=202)
 def cancel_job(context: Context, principal: Uploader, job_id: JobId) -> JobView:
-    """Cancel a job that waits or runs; what its finished stages left is kept for a rerun."""
+    """Cancel a job that waits or runs; results of its finished stages are kept for a rerun."""
     with context.database.session() as session:
         before = locked(session, job_id)
-        changes = before is not None and before.state != "cancelled"
+        is_change = before is not None and before.state != "cancelled"
         (view,) = job_views(session, [request_cancel(session, job_id)])
-        if changes:
+        if is_change:
             audit(session, principal.key_id, "job.cancel", job_id)
     stop_workflow(context, job_id)
     return view
 
 
 @router.delete("/jobs/{job_id}", status_code=204)
-def remove_job(context: Context, principal: Admin, job_id: JobId) -> None:
+def remove_job(context: Context, principal: Admin, clouds: CloudsDep, job_id: JobId) -> None:
     """Delete a job that has ended, with its result."""
-    delete_job(context, principal.key_id, job_id)
+    delete_job(context, clouds, principal.key_id, job_id)
 
 
 @router.get("/jobs/{job_id}/report")
 def get_report(context: Context, principal: Reader, job_id: JobId) -> Report:
-    """The report on the job's result."""
+    """Return the report on the job's result."""
     with context.database.session() as session:
         job = found_job(session, job_id)
         if job.state != "succeeded":
@@ -145,7 +150,7 @@ def get_report(context: Context, principal: Reader, job_id: JobId) -> Report:
 def get_log(
     context: Context, principal: Reader, job_id: JobId, after: AfterSeq = None, limit: Limit = 100
 ) -> Page[LogLine]:
-    """The job's log, oldest line first."""
+    """Return the job's log, oldest line first."""
     query = (
         sa.select(JobEvent)
         .where(JobEvent.job_id == job_id, JobEvent.type == "log", JobEvent.seq > (after or 0))
@@ -165,28 +170,29 @@ def get_log(
     "/jobs/{job_id}/events",
     response_class=Response,
     responses={
-        200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}, "description": "Events as they come"},
-        204: {"description": "The job has ended and there is nothing after the last event seen: do not come again"},
+        200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}, "description": "Events as they occur"},
+        204: {"description": "The job has ended and there is no event after the last one seen: do not reconnect"},
     },
 )
 async def follow_events(
     context: Context,
     principal: Reader,
+    events: EventsDep,
     job_id: JobId,
     last_event_id: LastEventId = None,
     after: AfterSeq = None,
 ) -> Response:
-    """What happens to the job, from its beginning or after the last event seen, until it ends.
+    """Stream the job's events, from its beginning or after the last event seen, until it ends.
 
     `event` is `state` {state, error, cloud_id}, `progress` {stage, progress} or `log` {level, message, data}; `id`
-    counts from 1. A comment comes every 15 s where nothing else does.
+    counts from 1. A comment is sent every 15 s while there is no event.
     """
     start = int(last_event_id) if last_event_id else after or 0
     if await run_in_threadpool(_nothing_after, context, job_id, start):
         return Response(status_code=204)
     return EventSourceResponse(
-        _encoded(context, job_id, start),
-        # Proxies that gather answers would keep the events back.
+        _encoded(events, job_id, start),
+        # Proxies that buffer answers would hold the events back.
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
 
@@ -195,12 +201,12 @@ def _nothing_after(context: AppContext, job_id: str, seq: int) -> bool:
     with context.database.session() as session:
         job = found_job(session, job_id)
         later = sa.select(JobEvent.seq).where(JobEvent.job_id == job_id, JobEvent.seq > seq).limit(1)
-        # The state first: events that come between the two looks are then seen.
+        # The state first, so that events between the two queries are seen.
         return job.state in FINAL_STATES and session.scalar(later) is None
 
 
-async def _encoded(context: AppContext, job_id: str, after: int) -> AsyncIterator[bytes]:
-    async for event in context.events.follow(job_id, after):
+async def _encoded(events: JobEvents, job_id: str, after: int) -> AsyncIterator[bytes]:
+    async for event in events.follow(job_id, after):
         if event is None:
             yield KEEPALIVE_COMMENT
         else:

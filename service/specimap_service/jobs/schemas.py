@@ -1,4 +1,4 @@
-"""What clients send about jobs, and what they read of their logs."""
+"""Requests for jobs, and lines of their logs."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from specimap_infra.job_schemas import JobSettings, PriorityName
 
 JobId = Annotated[str, Path(pattern=r"^job_[0-9a-z]{26}$")]
 AfterJob = Annotated[str | None, Query(pattern=r"^job_[0-9a-z]{26}$", description="`next` of the page before.")]
-AfterSeq = Annotated[int | None, Query(ge=0, lt=2**31, description="Only what came after the event of this number.")]
+AfterSeq = Annotated[int | None, Query(ge=0, lt=2**31, description="Only events after the one of this number.")]
 IdempotencyKey = Annotated[
     str | None,
     Header(
         pattern=r"^[\x20-\x7e]{1,128}$",
-        description="A name for this request: sent again with the same, it answers with the job it made before.",
+        description="A name for this request: sent again with the same name, it returns the job created before.",
     ),
 ]
 LastEventId = Annotated[
@@ -28,14 +28,14 @@ LastEventId = Annotated[
 
 
 class Webhook(BaseModel):
-    """Who to tell that the job has ended."""
+    """An address that is notified when the job has ended."""
 
     model_config = ConfigDict(
         extra="forbid",
         json_schema_extra={"example": {"url": "https://pacs.example/specimap", "secret": "0f6a3c0b1d5e4a7f"}},
     )
 
-    url: str = Field(max_length=2000, description="Its host is one that the service may send to.")
+    url: str = Field(max_length=2000, description="Its host must be one that the service may send to.")
     secret: str = Field(
         min_length=16,
         max_length=256,
@@ -46,7 +46,7 @@ class Webhook(BaseModel):
 
 
 class JobRequest(BaseModel):
-    """A job to be made."""
+    """A job to be created."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -65,33 +65,33 @@ class JobRequest(BaseModel):
     webhook: Webhook | None = None
 
     def digest(self) -> str:
-        """Hash by which the same request is known again."""
+        """Return a hash that is the same for the same request."""
         return digest_of(self.model_dump(mode="json"))
 
 
 class RerunRequest(BaseModel):
-    """A job to be made as another was, but for what is given here."""
+    """A job to be created with another one's settings, but for those given here."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"example": {"settings": {"r_pc": 0.25}}})
 
-    settings: JobSettings | None = Field(default=None, description="What is left out is as it was.")
-    priority: PriorityName | None = Field(default=None, description="By default as it was.")
-    webhook: Webhook | None = Field(default=None, description="By default as it was; null sends nothing.")
+    settings: JobSettings | None = Field(default=None, description="Settings left out stay as they were.")
+    priority: PriorityName | None = Field(default=None, description="By default unchanged.")
+    webhook: Webhook | None = Field(default=None, description="By default unchanged; null sends nothing.")
 
     def digest(self, job_id: str) -> str:
-        """Hash by which the same request is known again."""
+        """Return a hash that is the same for the same request."""
         return digest_of({"rerun": job_id, **self.model_dump(mode="json", exclude_unset=True)})
 
 
 def digest_of(request: dict[str, Any]) -> str:
-    """SHA-256 of a request's values."""
+    """Return the SHA-256 of a request's values."""
     return hashlib.sha256(json_text(request, sort_keys=True).encode()).hexdigest()
 
 
 class LogLine(BaseModel):
     """A line of a job's log."""
 
-    seq: int = Field(description="The event's number; gaps are events of another type.")
+    seq: int = Field(description="The event's number; the numbers between are events of another type.")
     at: datetime.datetime
     level: str
     message: str

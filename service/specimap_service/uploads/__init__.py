@@ -1,1 +1,1 @@
-"""Files on their way in."""
+"""Uploads: resumable ones, and several files in one form."""

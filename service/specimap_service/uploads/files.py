@@ -1,4 +1,4 @@
-"""Where the bytes of uploads under way lie: one file each on a local disk, locked by whoever writes to it.
+"""Files of unfinished uploads: one each on a local disk, locked by the request that writes to it.
 
 The file's size is the offset: a process killed in the middle of a write leaves a shorter file with the right bytes.
 """
@@ -21,7 +21,7 @@ POLL_SECONDS = 0.05
 
 
 class UploadFiles:
-    """The files of a folder, by upload id."""
+    """Files of unfinished uploads in one folder, by upload id."""
 
     def __init__(self, folder: Path) -> None:
         with disk_errors(folder):
@@ -29,30 +29,30 @@ class UploadFiles:
         self.folder = folder
 
     def path(self, upload_id: str) -> Path:
-        """Where an upload's bytes lie. Raises NotFoundError for what is no upload's id."""
+        """Return the path of an upload's file. Raises NotFoundError where the text is not an upload's id."""
         if not (upload_id.startswith("up_") and PATTERN.match(upload_id)):
             raise no_upload()
         return self.folder / upload_id
 
     def create(self, upload_id: str) -> None:
-        """An empty file. Raises StorageFullError."""
+        """Create an empty file. Raises StorageFullError."""
         path = self.path(upload_id)
         with disk_errors(path):
             os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600))
 
     def size(self, upload_id: str) -> int | None:
-        """Bytes that have arrived; None where there is no file."""
+        """Return the bytes that have arrived; None where there is no file."""
         try:
             return self.path(upload_id).stat().st_size
         except FileNotFoundError:
             return None
 
     def remove(self, upload_id: str) -> None:
-        """Remove the file if it is there."""
+        """Remove the file, if there is one."""
         self.path(upload_id).unlink(missing_ok=True)
 
     def try_lock(self, upload_id: str) -> int | None:
-        """A descriptor to append with, that holds the lock until closed; None where another one holds it.
+        """Lock the file; return a descriptor to append with, which holds the lock until closed; None if it is locked.
 
         Raises:
             NotFoundError: there is no file.
@@ -69,7 +69,7 @@ class UploadFiles:
         except BlockingIOError:
             os.close(handle)
             return None
-        # Removed between opening and locking: what we hold is nobody's file any more.
+        # The file was removed between opening and locking.
         os.close(handle)
         raise no_upload()
 
@@ -86,8 +86,8 @@ class UploadFiles:
         finally:
             os.close(handle)
 
-    def strays(self, known: set[str], seconds: float) -> list[Path]:
-        """Files that belong to no upload of ``known`` and were last written more than ``seconds`` ago."""
+    def abandoned(self, known: set[str], seconds: float) -> list[Path]:
+        """List files that belong to no upload of ``known`` and were last written more than ``seconds`` ago."""
         found = []
         for path in self.folder.iterdir():
             with suppress(FileNotFoundError):
@@ -97,12 +97,12 @@ class UploadFiles:
 
 
 def no_upload() -> NotFoundError:
-    """The error for an unknown upload."""
+    """Make the error for an unknown upload."""
     return NotFoundError("There is no such upload.", advice="Create one with POST /v1/uploads.")
 
 
 def busy() -> UploadLockedError:
-    """The error for a locked upload."""
+    """Make the error for a locked upload."""
     return UploadLockedError(
         "Another request is writing to this upload.", advice="Ask for the offset with HEAD in a second, and go on."
     )

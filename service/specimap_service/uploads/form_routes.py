@@ -1,4 +1,4 @@
-"""Files of an acquisition sent in one form."""
+"""Upload of several files of an acquisition in one form."""
 
 from __future__ import annotations
 
@@ -13,18 +13,20 @@ from specimap_service.acquisitions.capacity import (
     check_count,
     check_disks,
     check_size,
-    largest,
+    max_file_bytes,
     no_acquisition,
     quota_left,
 )
 from specimap_service.acquisitions.inspection import Arrival
-from specimap_service.acquisitions.intake import shown_name, take_in
+from specimap_service.acquisitions.intake import clean_name, take_in
 from specimap_service.acquisitions.schemas import AcquisitionId, File
-from specimap_service.auth.keys import Principal, Uploader
+from specimap_service.auth.dependencies import Uploader
+from specimap_service.auth.keys import Principal
 from specimap_service.context import AppContext, Context
 from specimap_service.errors import QuotaExceededError, RequestInvalidError
+from specimap_service.uploads.dependencies import UploadsDep
+from specimap_service.uploads.lifecycle import Uploads
 from specimap_service.uploads.multipart import FormFiles, Part
-from specimap_service.uploads.routes import Files
 
 router = APIRouter(prefix="/v1", tags=["files"])
 DISK_EVERY = 64 * 1024 * 1024
@@ -52,16 +54,16 @@ FORM: dict[str, Any] = {
 }
 
 
-class _Room:
+class _FormLimits:
     """The limits of one request; ``left`` bytes are left of the key's quota."""
 
     def __init__(self, context: AppContext, acquisition_id: str, left: int) -> None:
         self._context, self._acquisition_id, self._left = context, acquisition_id, left
         self._photos = 0
-        self._asked_at = 0
+        self._disk_checked_at = 0
 
     def begin(self, role: str, files: int) -> None:
-        """One more file."""
+        """Check that one more file may be added."""
         if role == "photo":
             self._photos += 1
             with self._context.database.session() as session:
@@ -70,17 +72,17 @@ class _Room:
             raise RequestInvalidError("More than 20 files in one form.", advice="Send fewer at a time.")
 
     def grow(self, role: str, size: int, total: int) -> None:
-        """More bytes."""
-        if size > largest(self._context.settings, role):
+        """Check that a file may have ``size`` bytes, and all files together ``total``."""
+        if size > max_file_bytes(self._context.settings, role):
             check_size(self._context.settings, role, size)
         if total > self._left:
-            raise _over_quota(self._left)
-        if total - self._asked_at > DISK_EVERY:
-            self._asked_at = total
+            raise _quota_exceeded(self._left)
+        if total - self._disk_checked_at > DISK_EVERY:
+            self._disk_checked_at = total
             check_disks(self._context, 0)
 
 
-def _over_quota(left: int) -> QuotaExceededError:
+def _quota_exceeded(left: int) -> QuotaExceededError:
     return QuotaExceededError(
         f"The key's quota leaves {max(left, 0)} bytes.",
         advice="Delete acquisitions that are no longer needed, or ask the administrator for a higher quota.",
@@ -90,21 +92,21 @@ def _over_quota(left: int) -> QuotaExceededError:
 
 @router.post("/acquisitions/{acquisition_id}/files", status_code=201, openapi_extra=FORM)
 async def add_files(
-    context: Context, principal: Uploader, uploads: Files, request: Request, acquisition_id: AcquisitionId
+    context: Context, principal: Uploader, uploads: UploadsDep, request: Request, acquisition_id: AcquisitionId
 ) -> list[File]:
     """Send some files in one form: `role` before its files. For large files and shaky networks use /v1/uploads."""
-    room = await asyncio.to_thread(_room, context, principal, request, acquisition_id)
-    form = FormFiles(uploads.folder, room)
+    limits = await asyncio.to_thread(_limits, context, principal, request, acquisition_id)
+    form = FormFiles(uploads.files.folder, limits)
     try:
         parts = await form.read(request)
         context.metrics.uploaded.inc(sum(part.size for part in parts))
-        return await asyncio.to_thread(_store, context, principal, acquisition_id, parts)
+        return await asyncio.to_thread(_store, uploads, principal, acquisition_id, parts)
     finally:
         await asyncio.to_thread(form.close)
 
 
-def _room(context: AppContext, principal: Principal, request: Request, acquisition_id: str) -> _Room:
-    """All that can be refused before the body is read."""
+def _limits(context: AppContext, principal: Principal, request: Request, acquisition_id: str) -> _FormLimits:
+    """Check before the body is read whatever can be checked then; return the limits for the rest."""
     length = request.headers.get("content-length", "0")
     announced = int(length) if length.isdecimal() else 0
     settings = context.settings
@@ -118,22 +120,23 @@ def _room(context: AppContext, principal: Principal, request: Request, acquisiti
     if announced > most:
         check_size(settings, "cube", announced)
     if announced > left + (1 << 20):
-        raise _over_quota(left)
-    return _Room(context, acquisition_id, left)
+        raise _quota_exceeded(left)
+    return _FormLimits(context, acquisition_id, left)
 
 
-def _store(context: AppContext, principal: Principal, acquisition_id: str, parts: list[Part]) -> list[File]:
+def _store(uploads: Uploads, principal: Principal, acquisition_id: str, parts: list[Part]) -> list[File]:
     stored: list[File] = []
     for part in parts:
         if not part.size:
             raise RequestInvalidError("A file is empty.", advice="Send the file itself.", stored=[f.id for f in stored])
         row = take_in(
-            context,
+            uploads.context,
+            uploads.judge,
             Arrival(
                 new_id("file"),
                 acquisition_id,
                 part.role,
-                shown_name(part.name),
+                clean_name(part.name),
                 part.path,
                 part.size,
                 part.sha256,

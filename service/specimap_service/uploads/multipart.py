@@ -1,4 +1,4 @@
-"""Files from a multipart form, each to a file on the local disk while it arrives, within limits."""
+"""Files of a multipart form, each written to the local disk while it arrives, within limits."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ if TYPE_CHECKING:
 
 LONGEST_FIELD = 256
 LONGEST_HEADER, MOST_HEADERS = 8192, 16
-"""Of one part."""
-MOST_BESIDE = 2 * 1024 * 1024
-"""Bytes of a form beside those of its files: boundaries, headers, fields, and what has come of the next."""
+"""Limits of one part."""
+MOST_OVERHEAD = 2 * 1024 * 1024
+"""Bytes of a form that are not of its files: boundaries, headers, fields, and the beginning of the next part."""
 BATCH = 1024 * 1024
 _SHA256 = re.compile(r"^[0-9a-fA-F]{64}$")
 
 
 class Limits(Protocol):
-    """Asked before a file begins, and as it grows."""
+    """Limits that are checked before a file begins, and as it grows."""
 
     def begin(self, role: str, files: int) -> None:
         """Raise where one more file, the ``files``-th of the request, is too many."""
@@ -54,7 +54,7 @@ class Part:
 
 @dataclass
 class _State:
-    """Where the parser stands. ``header`` collects one header, ``options`` those of the part's disposition."""
+    """State of the parser. ``header_…`` collect one header, ``options`` are those of the part's disposition."""
 
     header_name: bytearray = field(default_factory=bytearray)
     header_value: bytearray = field(default_factory=bytearray)
@@ -64,7 +64,7 @@ class _State:
 
 
 class FormFiles:
-    """Reads a form with the fields ``role``, ``sha256`` (of the next file) and ``file``; a role holds for the files
+    """A form with the fields ``role``, ``sha256`` (of the next file) and ``file``; a role holds for the files
     that follow it.
     """
 
@@ -80,11 +80,12 @@ class FormFiles:
         self._state = _State()
 
     async def read(self, request: Request) -> list[Part]:
-        """All files of the request's body, at least one.
+        """Read all files of the request's body, at least one.
 
         Raises:
-            RequestInvalidError: it is no such form. ChecksumMismatchError: a file is not the one it should be.
-            Whatever the limits raise; StorageFullError.
+            RequestInvalidError: the body is not such a form.
+            ChecksumMismatchError: a file does not have the checksum that the form gives.
+            StorageFullError, PayloadTooLargeError, QuotaExceededError: a file does not fit the disk or the limits.
         """
         kind, options = parse_options_header(request.headers.get("content-type"))
         if kind != b"multipart/form-data" or not options.get(b"boundary"):
@@ -93,17 +94,17 @@ class FormFiles:
             )
         try:
             parser = MultipartParser(options[b"boundary"], self._callbacks())
-            buffer, came = bytearray(), 0
+            buffer, received = bytearray(), 0
             async for chunk in request.stream():
                 buffer += chunk
                 if len(buffer) >= BATCH:
-                    came += len(buffer)
-                    # In a thread, since a form of thousands of tiny parts takes long to take apart.
-                    await asyncio.to_thread(self._feed, parser, bytes(buffer), came)
+                    received += len(buffer)
+                    # In a thread, since parsing a form of thousands of tiny parts takes long.
+                    await asyncio.to_thread(self._feed, parser, bytes(buffer), received)
                     buffer.clear()
-            await asyncio.to_thread(self._feed, parser, bytes(buffer), came + len(buffer))
+            await asyncio.to_thread(self._feed, parser, bytes(buffer), received + len(buffer))
             parser.finalize()
-            await asyncio.to_thread(self._work_off)
+            await asyncio.to_thread(self._process_events)
         except FormParserError as error:
             raise RequestInvalidError("The form does not read.", advice="Send multipart/form-data.") from error
         if not self._ended or self._file is not None:
@@ -113,13 +114,13 @@ class FormFiles:
         return self.parts
 
     def close(self) -> None:
-        """Remove what was not taken."""
+        """Remove the files that were not taken."""
         if self._file is not None:
             self._file.close()
         for part in self.parts:
             remove(part.path)
 
-    # ---- the parser's events, collected and worked off in a thread ------------------------------------
+    # ---- the parser's events, collected, then processed in a thread ------------------------------------
 
     def _callbacks(self) -> MultipartCallbacks:
         state = self._state
@@ -169,15 +170,15 @@ class FormFiles:
             "on_end": lambda: state.pending.append(("end", b"")),
         }
 
-    def _feed(self, parser: MultipartParser, data: bytes, came: int) -> None:
+    def _feed(self, parser: MultipartParser, data: bytes, received: int) -> None:
         parser.write(data)
-        self._work_off()
-        if came - self._total > MOST_BESIDE:
+        self._process_events()
+        if received - self._total > MOST_OVERHEAD:
             raise PayloadTooLargeError(
-                "The form holds too much beside its files.", advice="Send `role` and `file`.", limit_bytes=MOST_BESIDE
+                "The form holds too much beside its files.", advice="Send `role` and `file`.", limit_bytes=MOST_OVERHEAD
             )
 
-    def _work_off(self) -> None:
+    def _process_events(self) -> None:
         pending, self._state.pending = self._state.pending, []
         with disk_errors(self._folder):
             for what, data in pending:

@@ -1,8 +1,9 @@
-"""tus 1.0 around ``tuspyserver``: its storage on our files, and what it lacks or does otherwise than the protocol.
+"""tus 1.0 around ``tuspyserver``: the parts of the protocol that the library lacks or does differently.
 
-What is added: offsets that survive a killed process, checksums, locks that a dead connection does not keep, errors
-that reach the client (it answers a full disk with success), Location without trust in ``X-Forwarded-Host``, headers
-of HEAD. Every request to an upload has one :class:`Exchange`, which these parts share.
+Added are offsets that survive a killed process, checksums, locks that a dead connection does not keep, errors that
+reach the client (the library answers a full disk with success), a Location that does not trust
+``X-Forwarded-Host``, and headers of HEAD. Every request to an upload has one :class:`Exchange`, which these parts
+share.
 """
 
 from __future__ import annotations
@@ -31,11 +32,11 @@ ALGORITHMS = ("sha1", "sha256", "md5")
 BATCH = 1024 * 1024
 IN_MEMORY = 8 * BATCH
 SILENT_SECONDS = 30.0
-"""Silence in the middle of a body after which the connection counts as lost: a network that fell away says nothing."""
+"""Silence within a body after which the connection counts as lost: a network that failed sends no sign of it."""
 
 
 class Exchange:
-    """One request: its body, whose upload it is about, and headers for the answer."""
+    """One request: its body, its upload, its principal, and headers for the answer."""
 
     def __init__(self, receive: Receive, method: str) -> None:
         self._receive = receive
@@ -49,7 +50,7 @@ class Exchange:
         self.headers: dict[str, str] = {}
 
     async def receive(self) -> Message:
-        """The next message: of a body that was checked before, or of the connection."""
+        """Return the next message: of a body that was checked before, or of the connection."""
         if self._spool is not None:
             piece = await asyncio.to_thread(self._spool.read, BATCH)
             if not piece:
@@ -68,7 +69,7 @@ class Exchange:
             self._timeout = None
 
     def silent_seconds(self) -> float:
-        """For how long nothing has arrived, while something is waited for."""
+        """Return for how long the request has waited without receiving anything."""
         return 0.0 if self._timeout is None else asyncio.get_running_loop().time() - self._since
 
     def abandon(self) -> None:
@@ -77,10 +78,12 @@ class Exchange:
             self._timeout.reschedule(asyncio.get_running_loop().time())
 
     async def verify(self, most: int, folder: Path) -> None:
-        """Take in the whole body, at most ``most`` bytes, aside; hand it on only if it has the checksum.
+        """Receive the whole body, at most ``most`` bytes, into a temporary file; pass it on if its checksum is right.
 
         Raises:
-            ChecksumMismatchError, UploadConflictError: it has not, or is too long; StorageFullError.
+            ChecksumMismatchError: its checksum is another one.
+            UploadConflictError: it is too long, or the connection broke.
+            StorageFullError: the temporary file does not fit.
         """
         assert self.checksum is not None
         algorithm, expected = self.checksum
@@ -110,7 +113,7 @@ class Exchange:
         self._spool = spool
 
     def close(self) -> None:
-        """Let go of what was not read."""
+        """Discard the part that was not read."""
         if self._spool is not None:
             self._spool.close()
 
@@ -119,17 +122,17 @@ _EXCHANGE: ContextVar[Exchange] = ContextVar("exchange")
 
 
 def exchange() -> Exchange:
-    """That of the current request."""
+    """Return the exchange of the current request."""
     return _EXCHANGE.get()
 
 
 def too_long() -> UploadConflictError:
-    """The error for more bytes than announced."""
+    """Make the error for more bytes than announced."""
     return UploadConflictError("There are more bytes than Upload-Length says.", advice="Send what is missing only.")
 
 
 def parsed_checksum(given: str) -> tuple[str, bytes]:
-    """Algorithm and digest of an Upload-Checksum header. Raises RequestInvalidError."""
+    """Return algorithm and digest of an Upload-Checksum header. Raises RequestInvalidError."""
     algorithm, _, encoded = given.strip().partition(" ")
     try:
         if algorithm not in ALGORITHMS:
@@ -144,12 +147,12 @@ def parsed_checksum(given: str) -> tuple[str, bytes]:
 
 
 def http_date(upload: Upload) -> str:
-    """When an upload expires, as HTTP writes dates."""
+    """Return when an upload expires, as HTTP writes dates."""
     return format_datetime(upload.expires_at, usegmt=True)
 
 
-class Wire:
-    """Middleware: makes the exchange, and puts requests and answers right on their way to the library and back."""
+class TusMiddleware:
+    """Middleware that makes the exchange, and corrects requests to the library and its answers."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -171,10 +174,10 @@ class Wire:
         if scope["method"] == "PATCH" and "content-length" not in headers:
             # A streamed body has none. The library refuses that, but only after having appended it.
             scope["headers"].append((b"content-length", b"0"))
-        own = Exchange(receive, scope["method"])
-        token = _EXCHANGE.set(own)
+        current = Exchange(receive, scope["method"])
+        token = _EXCHANGE.set(current)
 
-        async def put_right(message: Message) -> None:
+        async def send_corrected(message: Message) -> None:
             if message["type"] == "http.response.start":
                 answer = MutableHeaders(raw=message.get("headers", []))
                 answer["Tus-Resumable"] = VERSION
@@ -183,12 +186,12 @@ class Wire:
                 if scope["method"] == "HEAD":
                     del answer["Content-Length"]
                 if message["status"] < 300:
-                    answer.update(own.headers)
+                    answer.update(current.headers)
                 message = {**message, "headers": answer.raw}
             await send(message)
 
         try:
-            await self._app(scope, own.receive, put_right)
+            await self._app(scope, current.receive, send_corrected)
         finally:
             _EXCHANGE.reset(token)
-            own.close()
+            current.close()

@@ -1,4 +1,4 @@
-"""The storage that ``tuspyserver`` writes to: our upload files, with rows instead of side files."""
+"""The storage interface of ``tuspyserver`` on our upload files, with database rows instead of its side files."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ TAKEOVER_SECONDS = 2.0
 LOCK_SECONDS = 4.0
 
 
-class _Held:
-    """A locked file that a request appends to. ``error`` is what a write failed with."""
+class _LockedFile:
+    """A locked file that a request appends to. ``error``: why a write failed."""
 
     def __init__(self, handle: int, holder: Exchange) -> None:
         self.holder = holder
@@ -35,7 +35,7 @@ class _Held:
         self._lock = threading.Lock()
 
     def write(self, folder: Path, *, sync: bool) -> int:
-        """Append what is pending; returns its bytes. Raises StorageFullError, StorageUnavailableError."""
+        """Append the pending bytes; return how many. Raises StorageFullError, StorageUnavailableError."""
         with self._lock:
             data, self.pending = self.pending, bytearray()
             try:
@@ -54,58 +54,58 @@ class _Held:
             return len(data)
 
     def close(self) -> None:
-        """Let go of the file and its lock; waits for a write that a cancelled request left under way."""
+        """Close the file and release its lock, after a write that a cancelled request may have left unfinished."""
         with self._lock:
             os.close(self._handle)
-            # A write that begins after this fails instead of reaching another file of the same number.
+            # A later write then fails instead of reaching another file of the same number.
             self._handle = -1
 
 
 class UploadStore(TusStorage):
-    """The library's storage interface on :class:`UploadFiles`. Rows, not side files, say what an upload is."""
+    """The library's storage interface on :class:`UploadFiles`. Uploads are described by rows, not by side files."""
 
     def __init__(
         self, files: UploadFiles, *, received: Callable[[int], None], delete: Callable[[str, Principal], None]
     ) -> None:
         self._files, self._received, self._delete = files, received, delete
-        self._held: dict[str, _Held] = {}
+        self._locked: dict[str, _LockedFile] = {}
 
     async def create(self, uid: str) -> None:
-        """Nothing: the file was made before the row."""
+        """Do nothing: the file was created before the row."""
 
     async def exists(self, uid: str) -> bool:
-        """Whether the request's upload has a file, or once had it whole."""
+        """Return whether the request's upload has a file, or had a complete one."""
         upload = exchange().upload
         return upload is not None and (upload.state != "open" or self._files.size(uid) is not None)
 
     async def size(self, uid: str) -> int:
-        """Bytes that have arrived."""
+        """Return the bytes that have arrived."""
         upload = exchange().upload
         if upload is not None and upload.state != "open":
             return upload.size
         return self._files.size(uid) or 0
 
     async def append(self, uid: str, chunk: bytes) -> None:
-        """Take a piece; it is written with others."""
-        held = self._held[uid]
+        """Take a piece; it is written together with others."""
+        held = self._locked[uid]
         held.pending += chunk
         if len(held.pending) >= BATCH:
             await asyncio.to_thread(self._write, held, sync=False)
 
     async def flush(self, uid: str) -> None:
-        """Bring everything to the disk."""
-        if uid in self._held:
-            await asyncio.to_thread(self._write, self._held[uid], sync=True)
+        """Write everything to disk."""
+        if uid in self._locked:
+            await asyncio.to_thread(self._write, self._locked[uid], sync=True)
 
-    def _write(self, held: _Held, *, sync: bool) -> None:
-        # A failure is raised again when the lock is let go: from here the library would answer it with success.
+    def _write(self, held: _LockedFile, *, sync: bool) -> None:
+        # Raised again when the lock is released: the library would answer a failure here with success.
         self._received(held.write(self._files.folder, sync=sync))
 
     async def finalize(self, uid: str) -> None:
-        """Nothing: a whole file is finished by the completion hook."""
+        """Do nothing: the completion hook finishes a whole file."""
 
     async def read(self, uid: str) -> bytes | None:
-        """Never asked for."""
+        """Return nothing; the library is never asked to read."""
         return None
 
     async def delete(self, uid: str) -> None:
@@ -116,7 +116,7 @@ class UploadStore(TusStorage):
             await asyncio.to_thread(self._delete, uid, principal)
 
     async def read_info(self, uid: str) -> dict[str, Any] | None:
-        """What the library keeps in a side file; names stay out of it, since it logs them."""
+        """Return what the library would keep in a side file; without names, since it logs them."""
         upload = exchange().upload
         if upload is None:
             return None
@@ -129,22 +129,23 @@ class UploadStore(TusStorage):
         }
 
     async def write_info(self, uid: str, data: dict[str, Any]) -> None:
-        """Nothing: the row and the file's size say all."""
+        """Do nothing: the row and the file's size hold everything."""
 
     async def list_uids(self) -> list[str]:
-        """Never asked for."""
+        """Return nothing; the library is never asked to list."""
         return []
 
     def location(self, uid: str) -> str:
-        """The id: what the completion hook needs."""
+        """Return the id, which the completion hook needs."""
         return uid
 
     @asynccontextmanager
     async def lock(self, uid: str) -> AsyncIterator[None]:  # type: ignore[override]
-        """Hold the upload's file. A request on it that has gone silent gives way.
+        """Hold the upload's file. A request on it that has fallen silent is ended.
 
         Raises:
-            NotFoundError, UploadLockedError; at the end the error of a failed write.
+            NotFoundError, UploadLockedError: the file cannot be locked.
+            StorageFullError, StorageUnavailableError: at the end, where a write failed.
         """
         upload = exchange().upload
         if upload is not None and upload.state != "open":
@@ -153,17 +154,17 @@ class UploadStore(TusStorage):
         clock = asyncio.get_running_loop().time
         deadline = clock() + LOCK_SECONDS
         while (handle := self._files.try_lock(uid)) is None:
-            other = self._held.get(uid)
+            other = self._locked.get(uid)
             if other is not None and other.holder.silent_seconds() > TAKEOVER_SECONDS:
                 other.holder.abandon()
             if clock() > deadline:
                 raise busy()
             await asyncio.sleep(POLL_SECONDS)
-        held = self._held[uid] = _Held(handle, exchange())
+        held = self._locked[uid] = _LockedFile(handle, exchange())
         try:
             yield
         finally:
-            del self._held[uid]
+            del self._locked[uid]
             held.close()
         if held.error is not None:
             raise held.error

@@ -52,7 +52,7 @@ class Phantom:
                 for i, image in enumerate(images):
                     yield f"view_{i:03d}", image
             finally:
-                # Whoever stops early does not wait for the photos that are left.
+                # A caller that stops early does not wait for the remaining photos.
                 pool.shutdown(wait=False, cancel_futures=True)
 
     def _photo(self, index: int, scene: Scene, paint: Paint) -> NDArray[np.uint8]:
@@ -108,7 +108,7 @@ class Phantom:
 
     @cached_property
     def truth(self) -> Truth:
-        """What the phantom is, exactly."""
+        """The exact truth about the phantom."""
         s, scene, rendering = self.settings, self.scene, self._cube_rendering
         total = rendering.image.sum(2, keepdims=True)
         abundance = np.divide(rendering.image, total, out=np.zeros_like(rendering.image), where=total > 0)

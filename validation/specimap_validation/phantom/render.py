@@ -20,7 +20,7 @@ from specimap_validation.phantom.scene import BENCH, CARDS, KEY_LIGHTS, SPECIMEN
 CLASS_NONE, CLASS_SPECIMEN, CLASS_CARD, CLASS_TRAY, CLASS_BENCH = range(5)
 _CLASS_OF_GEOMETRY = np.array([CLASS_SPECIMEN, CLASS_CARD, CLASS_TRAY, CLASS_BENCH, CLASS_NONE], np.uint8)
 # Rays per pixel and step of a Fibonacci lattice, where every ray has a row and a column of its own. Any lattice has
-# directions in which its rays stand in few rows, to which an edge that runs along them is rounded (a square grid along
+# directions in which its rays lie in few rows, to which an edge that runs along them is rounded (a square grid along
 # the pixels, this one at 31 degrees): so each pixel's is shifted by chance, and an edge's pixels err apart.
 _SPECIMEN_RAYS, _BORDER_RAYS = 5, 34
 _LATTICE_STEP = {_SPECIMEN_RAYS: 3, _BORDER_RAYS: 21}
@@ -29,13 +29,13 @@ _SHININESS = 60.0
 _DETAIL_SD = 0.16
 _BENCH_LIGHT = 0.75
 # Rays at a time: arrays stay in the processor's cache, and products this small stay off the BLAS threads,
-# which would only fight with the threads that render photos side by side.
+# which would only fight with the threads that render photos in parallel.
 _BLOCK = 16384
 
 
 @dataclass(frozen=True)
 class Paint:
-    """What each material sends to each channel: ``basis`` (M, C).
+    """Response of each channel to each material: ``basis`` (M, C).
 
     ``vertex`` (V, C + 4): colour, irradiance and normal of the specimen's vertices.
     """
@@ -63,7 +63,7 @@ class Rendering:
 
 
 def render_view(scene: Scene, view: View, paint: Paint, *, gloss: float = 0.0) -> Rendering:
-    """What ``view`` sees of the scene; the lens's distortion is applied exactly."""
+    """Render the scene as ``view`` sees it; the lens's distortion is applied exactly."""
     h, w = view.intrinsics.height, view.intrinsics.width
     pixels = np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1).reshape(-1, 2).astype(float)
     colour, points, surface, geometry = _sample(scene, view, paint, pixels, gloss)
@@ -91,7 +91,7 @@ def _rays_per_pixel(surface: NDArray[np.int32], on_specimen: NDArray[np.bool_]) 
 def _sample(
     scene: Scene, view: View, paint: Paint, pixels: Floats, gloss: float
 ) -> tuple[Floats32, Floats, NDArray[np.int32], NDArray[np.int32]]:
-    """Colour (S, C), point (S, 3), surface (S,) that tells materials apart, geometry (S,); pixels (S, 2)."""
+    """Colour (S, C), point (S, 3), surface (S,) that distinguishes materials, geometry (S,); pixels (S, 2)."""
     colour = np.empty((len(pixels), paint.basis.shape[1]), np.float32)
     points = np.empty((len(pixels), 3))
     surface, geometry = (np.empty(len(pixels), np.int32) for _ in range(2))

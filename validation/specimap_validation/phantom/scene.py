@@ -1,4 +1,4 @@
-"""The scene: specimen, cards, tray and bench, what a ray meets, and how much light falls where."""
+"""The scene: specimen, cards, tray and bench; ray intersections and irradiance."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ class Scene:
 
 
 def build_scene(settings: PhantomSettings, moved: Pose | None = None) -> Scene:
-    """Specimen, ``moved`` where that is given, cards and tray of ``settings``, lit where they then stand.
+    """Build specimen, moved by ``moved`` if given, cards and tray of ``settings``, and the light on them.
 
     Raises as :func:`place_cards` does.
     """
@@ -142,7 +142,7 @@ def build_scene(settings: PhantomSettings, moved: Pose | None = None) -> Scene:
 
 
 def without_cards(scene: Scene) -> Scene:
-    """The same scene, its cards out of sight under the bench."""
+    """Return the same scene with its cards hidden under the bench."""
     under = scene.cards.outlines - [0, 0, scene.cards.outlines[..., 2].max() - BENCH_Z_MM + 1]
     return replace(scene, caster=_caster(scene.specimen, under, scene.tray_half_mm))
 

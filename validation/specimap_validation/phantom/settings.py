@@ -1,4 +1,4 @@
-"""What a phantom is made of: one frozen dataclass, checked when it is built."""
+"""Settings of a phantom: one frozen dataclass, checked when it is built."""
 
 from __future__ import annotations
 
@@ -82,13 +82,13 @@ class PhantomSettings:
     cube_aspect: float = 1.0
     """Height of a cube's pixel over its width."""
     cube_scan: Literal["none", "rows", "columns"] = "none"
-    """What a push-broom camera records one of at a time; ``none`` is a frame camera."""
+    """The line that a push-broom camera records at a time; ``none``: a frame camera."""
     scan_skew: float = 0.0
     """Motion along the line while the scan goes on by 1 mm: a stage that is not square to the line."""
     scan_pitch_deg: float = 0.0
     """Forward tilt of a push-broom camera that moves level."""
     scan_wobble_mm: float = 0.0
-    """Amplitude of what the stage runs ahead and behind, twice over the whole scan."""
+    """Amplitude by which the stage runs ahead and behind, in two periods over the whole scan."""
     cube_k1: float = 0.0
     """First radial distortion of a frame camera."""
     cube_noise: float = 0.005

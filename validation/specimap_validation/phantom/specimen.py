@@ -29,7 +29,7 @@ class Specimen:
 
 
 def build_specimen(settings: PhantomSettings) -> Specimen:
-    """A lumpy ellipsoid cut flat at the tray, wider above its base (undercut), of the stated extents."""
+    """Build a lumpy ellipsoid cut flat at the tray, wider above its base (undercut), of the stated extents."""
     rng = settings.rng(Stream.SHAPE)
     directions, triangles = cube_sphere(settings.mesh_divisions)
     size = np.array(settings.specimen_mm)
@@ -54,16 +54,16 @@ def build_specimen(settings: PhantomSettings) -> Specimen:
 
 
 def displacement(settings: PhantomSettings) -> Pose:
-    """Where the cube finds the specimen: a rigid map from its place in the photos to its place in the cube, mm."""
+    """Make the rigid map from the specimen's place in the photos to its place in the cube, mm."""
     tilt, turn = np.radians([settings.moved_tilt_deg, settings.moved_deg])
     R = rotation_from_vector(np.array([tilt, 0.0, 0.0])) @ rotation_from_vector(np.array([0.0, 0.0, turn]))
     base = np.array([0.0, 0.0, TRAY_Z_MM])
     return Pose(R, base - R @ base + np.array(settings.moved_mm))
 
 
-def displaced(specimen: Specimen, by: Pose) -> Specimen:
-    """The same tissue at another place."""
-    return replace(specimen, vertices=by.apply(specimen.vertices), normals=specimen.normals @ by.R.T)
+def displaced(specimen: Specimen, motion: Pose) -> Specimen:
+    """Move the specimen rigidly; its tissue stays the same."""
+    return replace(specimen, vertices=motion.apply(specimen.vertices), normals=specimen.normals @ motion.R.T)
 
 
 def _rest_on_tray(vertices: Floats, settings: PhantomSettings) -> Floats:

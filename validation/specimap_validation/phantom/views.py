@@ -1,4 +1,4 @@
-"""Where the phantom's cameras stand: photos on rings around the specimen, the cube's camera above it."""
+"""Cameras of the phantom: photos on rings around the specimen, the cube's camera above it."""
 
 from __future__ import annotations
 

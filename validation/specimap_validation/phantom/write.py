@@ -61,7 +61,7 @@ def write_phantom(
 
 
 def write_cube(cube: NDArray[np.uint16], wavelengths_nm: Floats, header: Path, *, interleave: str) -> None:
-    """Write a cube (rows, columns, bands) of scaled reflectance: ENVI ``header`` and ``.raw`` beside it."""
+    """Write a cube (rows, columns, bands) of scaled reflectance: ENVI ``header``, and ``.raw`` in the same folder."""
     rows, cols, bands = cube.shape
     with atomic_path(header.with_suffix(".raw")) as aside:
         np.ascontiguousarray(cube.transpose(_AXES[interleave]), "<u2").tofile(aside)

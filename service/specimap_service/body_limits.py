@@ -1,6 +1,6 @@
-"""What of a request's body is read, and when: nothing before the key is known, and never more than its kind may have.
+"""Limits on request bodies: none is read before the key is known, and none beyond the size that its kind may have.
 
-Files and labels are written to the disk as they come, within limits of their own. All other bodies are JSON documents,
+Files and labels are written to disk as they arrive, within limits of their own. All other bodies are JSON documents,
 which are read into memory.
 """
 
@@ -18,42 +18,42 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from specimap_core.errors import SpecimapError
 from specimap_infra.logs import logger
-from specimap_service.auth.keys import PRINCIPAL, authenticated
+from specimap_service.auth.dependencies import PRINCIPAL, authenticated
 from specimap_service.errors import PayloadTooLargeError, RequestInvalidError
 from specimap_service.http_status import status_of
 from specimap_service.problems import problem_response
 
 MIB = 1024 * 1024
 LARGEST_JSON = 64 * 1024
-"""Settings of a job, an acquisition, a key: a hundred times what they take."""
+"""Settings of a job, an acquisition, a key: a hundred times what they need."""
 LARGEST_SELECTION = 4 * MIB
-"""A page of points by number or by pixel: 100,000 with room for blanks."""
+"""A page of points by number or by pixel: 100,000 of them, with spare bytes for blanks."""
 MOST_FIELDS = 1000
-"""Names in a selection, and more: each that does not exist would be told of, which takes time."""
+"""More than the names in a selection: each unknown one would be listed in the answer, which takes time."""
 MOST_PARTS = 4000
-"""Colons and commas in another document: those of the longest notes, and more."""
+"""Colons and commas in another document: more than the longest notes hold."""
 SELECTIONS = (("POST", re.compile(r"/v1/clouds/[^/]+/spectra")),)
 FILES = (
     ("POST", re.compile(r"/v1/acquisitions/[^/]+/files")),
     ("PATCH", re.compile(r"/v1/uploads/[^/]+")),
     ("PUT", re.compile(r"/v1/clouds/[^/]+/labels/[^/]+")),
 )
-"""Requests whose bodies are taken to the disk by their own routes, which read them piece by piece."""
+"""Requests whose routes write the body to disk piece by piece."""
 WITHOUT_BODY = ("GET", "HEAD", "OPTIONS")
 Model = TypeVar("Model", bound=BaseModel)
 
 
 def most_bytes(method: str, path: str) -> int | None:
-    """Bytes that a request's body may have; None where its route sets limits of its own."""
+    """Return the bytes that a request's body may have; None where its route sets limits of its own."""
     if any(method == known and pattern.fullmatch(path) for known, pattern in FILES):
         return None
     selection = any(method == known and pattern.fullmatch(path) for known, pattern in SELECTIONS)
     return LARGEST_SELECTION if selection else LARGEST_JSON
 
 
-class Gate:
-    """Middleware: asks for the key before a byte of the body is read, and refuses bodies beyond their limit by what
-    they say of themselves, or else as they come."""
+class BodyLimits:
+    """Middleware that checks the key before a byte of the body is read, and refuses bodies beyond their limit: by their
+    Content-Length, or else as they arrive."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -82,16 +82,16 @@ class Gate:
             await self._counted(limit, scope, receive, send)
 
     async def _counted(self, limit: int, scope: Scope, receive: Receive, send: Send) -> None:
-        came = parts = 0
+        received = parts = 0
         refusal: SpecimapError | None = None
 
         async def counted() -> Message:
-            nonlocal came, parts, refusal
+            nonlocal received, parts, refusal
             message = await receive()
             body = message.get("body", b"")
-            came += len(body)
+            received += len(body)
             parts += body.count(b":") + body.count(b",")
-            if came > limit:
+            if received > limit:
                 refusal = _too_large(limit)
             elif limit == LARGEST_JSON and parts > MOST_PARTS:
                 refusal = _too_many()
@@ -100,7 +100,7 @@ class Gate:
             return message
 
         async def own(message: Message) -> None:
-            # What reads the body answers any error there with a 400 of its own: this one is told below.
+            # The code that reads the body answers any error with a 400 of its own; the refusal is sent below.
             if refusal is None:
                 await send(message)
 
@@ -123,13 +123,14 @@ def _too_many() -> RequestInvalidError:
     return RequestInvalidError("body: too many fields.", advice="Correct the request; /docs shows it.")
 
 
-async def parsed(request: Request, model: type[Model]) -> Model:
-    """A large JSON body, read by a thread, one at a time: other requests are answered meanwhile.
+async def parsed(request: Request, model: type[Model], limiter: CapacityLimiter) -> Model:
+    """Parse a large JSON body in a thread, so that other requests are answered meanwhile.
+
+    ``limiter`` bounds how many are parsed at a time.
 
     Raises:
-        RequestValidationError, RequestInvalidError: it is no such document.
+        RequestValidationError, RequestInvalidError: the body is not such a document.
     """
-    limiter: CapacityLimiter = request.app.state.parsing
     body = await request.body()
     return await to_thread.run_sync(partial(_parse, body, model), limiter=limiter)
 

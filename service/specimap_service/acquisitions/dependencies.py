@@ -1,0 +1,42 @@
+"""The judge of arriving files, and the unfinished uploads that go with a deleted acquisition."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Annotated, Protocol
+
+from fastapi import Depends, FastAPI
+
+from specimap_service.acquisitions.judge import Judge
+from specimap_service.app_state import AppState
+from specimap_service.context import AppContext
+from specimap_service.feature import Feature
+
+
+class UnfinishedUploads(Protocol):
+    """The bytes of unfinished uploads. The feature of uploads provides them, which itself builds on acquisitions."""
+
+    def remove(self, upload_id: str) -> None:
+        """Remove the bytes of an upload, if there are any."""
+
+
+JUDGE = AppState[Judge]("judge")
+UNFINISHED_UPLOADS = AppState[UnfinishedUploads]("unfinished_uploads")
+
+
+def _open(app: FastAPI, context: AppContext) -> None:
+    JUDGE.set(app, Judge(context.settings))
+
+
+@asynccontextmanager
+async def _running(app: FastAPI) -> AsyncIterator[None]:
+    try:
+        yield
+    finally:
+        JUDGE.of(app).close()
+
+
+FEATURE = Feature(_open, _running)
+JudgeDep = Annotated[Judge, Depends(JUDGE.of_request)]
+UnfinishedUploadsDep = Annotated[UnfinishedUploads, Depends(UNFINISHED_UPLOADS.of_request)]

@@ -1,0 +1,85 @@
+"""Authentication of requests: the key, its rate limit, its scopes."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from typing import Annotated
+
+import structlog
+from fastapi import Depends, FastAPI, Request
+from fastapi.concurrency import run_in_threadpool
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+
+from specimap_service.app_state import AppState
+from specimap_service.auth.keys import Keyring, Principal
+from specimap_service.auth.rate_limit import RateLimiter
+from specimap_service.context import AppContext
+from specimap_service.errors import ForbiddenError, UnauthorizedError
+from specimap_service.feature import Feature
+
+FAILURES_PER_MINUTE = 60
+"""Wrong keys that one address may present a minute before it has to wait."""
+KEYRING = AppState[Keyring]("keyring")
+LIMITER = AppState[RateLimiter]("limiter")
+
+
+def _open(app: FastAPI, context: AppContext) -> None:
+    settings = context.settings
+    KEYRING.set(app, Keyring(context.database, settings.rate_per_minute, settings.quota_bytes))
+    LIMITER.set(app, RateLimiter())
+
+
+FEATURE = Feature(_open)
+KeyringDep = Annotated[Keyring, Depends(KEYRING.of_request)]
+PRINCIPAL = "specimap.principal"
+"""Key under which a request's ASGI scope holds its principal, once that is known."""
+
+
+async def authenticated(request: Request) -> Principal:
+    """Return the principal of a request by its headers alone, and count it against the key's rate.
+
+    Raises:
+        UnauthorizedError: there is no key, or no valid one. RateLimitedError: too many requests, or wrong keys.
+        DatabaseUnavailableError: keys cannot be looked up.
+    """
+    keyring, limiter = KEYRING.of(request.app), LIMITER.of(request.app)
+    kind, _, key = request.headers.get("authorization", "").partition(" ")
+    if kind.lower() != "bearer" or not key.strip():
+        raise UnauthorizedError("There is no key.", advice="Send it as `Authorization: Bearer <key>`.")
+    key = key.strip()
+    try:
+        found = keyring.trusted(key)
+        if found is None:
+            # A thread costs as much as the rest of a short request, so it is taken only to ask the database.
+            found = await run_in_threadpool(keyring.principal, key)
+    except UnauthorizedError:
+        address = request.client.host if request.client else "unknown"
+        limiter.take(f"address:{address}", FAILURES_PER_MINUTE)
+        raise
+    limiter.take(found.key_id, found.rate_per_minute)
+    structlog.contextvars.bind_contextvars(key=found.key_id)
+    return found
+
+
+_bearer = HTTPBearer(auto_error=False, scheme_name="key", description="`Authorization: Bearer spk_…`")
+
+
+def requires(scope: str) -> Callable[..., Awaitable[Principal]]:
+    """Make a dependency: the request's principal, if its key has the scope. ``admin`` has all."""
+
+    async def principal(
+        request: Request, _: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
+    ) -> Principal:
+        # Already known where the request may have a body, which is not read before.
+        found: Principal = request.scope.get(PRINCIPAL) or await authenticated(request)
+        if scope not in found.scopes and "admin" not in found.scopes:
+            raise ForbiddenError(f"The key lacks the scope {scope!r}.", advice="Use a key that has it.", scope=scope)
+        return found
+
+    return principal
+
+
+Uploader = Annotated[Principal, Depends(requires("upload"))]
+Reader = Annotated[Principal, Depends(requires("read"))]
+Labeller = Annotated[Principal, Depends(requires("label"))]
+Admin = Annotated[Principal, Depends(requires("admin"))]

@@ -1,0 +1,52 @@
+"""Uploads of the app, and the task that removes expired ones while it runs."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from typing import Annotated
+
+from fastapi import Depends, FastAPI
+
+from specimap_core.errors import SpecimapError
+from specimap_infra.logs import logger
+from specimap_service.acquisitions.dependencies import JUDGE, UNFINISHED_UPLOADS
+from specimap_service.app_state import AppState
+from specimap_service.context import AppContext
+from specimap_service.feature import Feature
+from specimap_service.uploads.files import UploadFiles
+from specimap_service.uploads.lifecycle import Uploads
+
+SWEEP_SECONDS = 300.0
+UPLOADS = AppState[Uploads]("uploads")
+
+
+def _open(app: FastAPI, context: AppContext) -> None:
+    files = UploadFiles(context.settings.scratch / "uploads")
+    UPLOADS.set(app, Uploads(context, files, JUDGE.of(app)))
+    UNFINISHED_UPLOADS.set(app, files)
+
+
+@asynccontextmanager
+async def _running(app: FastAPI) -> AsyncIterator[None]:
+    task = asyncio.create_task(_sweep_forever(UPLOADS.of(app)))
+    try:
+        yield
+    finally:
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
+
+
+async def _sweep_forever(uploads: Uploads) -> None:
+    while True:
+        try:
+            await asyncio.to_thread(uploads.sweep)
+        except (SpecimapError, OSError):
+            logger().exception("sweeping of uploads failed")
+        await asyncio.sleep(SWEEP_SECONDS)
+
+
+FEATURE = Feature(_open, _running)
+UploadsDep = Annotated[Uploads, Depends(UPLOADS.of_request)]
