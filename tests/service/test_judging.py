@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from specimap_core.errors import BackendUnavailableError
 from specimap_core.photos.reading import AcquisitionSettings, read_photo
+from specimap_core.pipeline.options import Dictionary
 from specimap_core.screening.photo import Others, judge_photo
 from specimap_infra.completeness import LEAST_PHOTOS
 from specimap_infra.settings import load_settings
 from specimap_service.acquisitions.judge import Judge
-from specimap_service.acquisitions.schemas import Dictionary
 from tests.support.photo_files import bomb
 from tests.support.service_scene import Running
 from tests.support.upload_scene import client_at, key_in, new_acquisition, photos, process_serving, send, sent

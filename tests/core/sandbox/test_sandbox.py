@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from specimap_core.errors import SettingsError
-from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES
+from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES, backends_from
 from specimap_core.sandbox import Mode, Protection, Reach, confined, program_rules, protection
 from specimap_core.sandbox.launch import NOT_CONFINED
 from specimap_core.sandbox.places import interpreter_places
@@ -243,7 +243,7 @@ def test_stages_reach_what_the_environment_names_for_backends(tmp_path: Path, mo
     monkeypatch.setenv("SPECIMAP_DA3_WEIGHTS", str(weights))
     monkeypatch.setenv("SPECIMAP_MAST3R_HOME", str(home))
     monkeypatch.setenv("SPECIMAP_MAST3R_CACHE", str(cache))
-    cells = Cells(tmp_path / "work", "test", "require", ())
+    cells = Cells(tmp_path / "work", "test", "require", (), backends_from(os.environ))
     cell = cells.new()
     program = (
         "import sys; print(open(sys.argv[1]).read(), open(sys.argv[2]).read());"
