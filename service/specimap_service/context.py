@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -55,7 +56,7 @@ class AppContext:
             RateLimiter(),
             Metrics(database, storage),
             OpenClouds(storage, database),
-            Judge(settings),
+            Judge(settings, os.environ),
             JobEvents(database),
             PictureCache(),
         )

@@ -11,7 +11,6 @@ from specimap_core.errors import SpecimapError
 from specimap_core.reconstruct.backends.environment import backends_from
 from specimap_core.sandbox import hide_from_others
 from specimap_core.sandbox.lifetime import die_with
-from specimap_core.threads import limit_blas_threads
 from specimap_infra.database import Database
 from specimap_infra.logs import logger, set_up_logs
 from specimap_infra.migrate import migrate
@@ -21,7 +20,6 @@ from specimap_workers.stage_process import COMMAND
 
 def main() -> int:
     """Run a worker until it is stopped; 2 where it cannot start."""
-    limit_blas_threads()
     parser = argparse.ArgumentParser(prog="python -m specimap_workers")
     parser.add_argument("--slot", type=int, default=0)
     parser.add_argument("--kind", choices=("cpu", "gpu"), default="cpu")

@@ -14,12 +14,14 @@ import sys
 from pathlib import Path
 from typing import Any, TextIO
 
-from specimap_core.json_text import json_text
 from specimap_core.sandbox.lifetime import die_with
 from specimap_core.threads import limit_blas_threads
 
 
 def _say(out: TextIO, **event: object) -> None:
+    # Imported late, since it loads numpy.
+    from specimap_core.json_text import json_text
+
     out.write(json_text(event) + "\n")
     out.flush()
 

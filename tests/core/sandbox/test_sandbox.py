@@ -35,7 +35,7 @@ TEXT = Path(escapes.__file__).read_text("utf-8")
 
 JUDGING = f"""{TEXT}
 import json
-from specimap_core.screening import __main__ as child
+from specimap_core.screening import process as child
 from specimap_core.screening.verdict import Verdict
 
 def escape(task):
@@ -123,7 +123,7 @@ def untouched(told: dict[str, Any]) -> None:
 
 def in_judging(told: dict[str, Any], folder: Path, mode: Mode) -> dict[str, str]:
     settings = load_settings(data_dir=folder.parent / "data", sandbox=mode)
-    judge = Judge(settings, (sys.executable, "-c", JUDGING))
+    judge = Judge(settings, os.environ, (sys.executable, "-c", JUDGING))
     task = folder / "task"
     task.mkdir(parents=True)
     (task / "cube").write_text(json.dumps({**told, "link": str(linked(task, told))}))
