@@ -19,11 +19,13 @@ from specimap_core.json_text import json_text
 from specimap_core.photos.folder import photo_paths
 from specimap_core.pipeline.artefacts import load_stage1, load_stage2
 from specimap_core.pipeline.clock import Clock
+from specimap_core.pipeline.options import DEFAULTS, RunOptions
 from specimap_core.pipeline.outputs import Inputs, Outputs, prepare_folder
 from specimap_core.pipeline.register_stage import register_and_write
 from specimap_core.pipeline.run import run_pipeline
 from specimap_core.pipeline.settings import PipelineSettings, settings_from
 from specimap_core.pipeline.stages import adjust_stage, reconstruct_stage, render_stage
+from specimap_core.reconstruct.dense.device import dense_device
 from specimap_core.report.model import Report
 from specimap_core.surface.raycast import RayCaster
 
@@ -47,17 +49,8 @@ class _Steps:
 
 def settings_of(options: Namespace) -> PipelineSettings:
     """The published settings, with the markers that the options name."""
-    return settings_from(
-        edge_mm=options.edge_mm,
-        dictionary=options.dictionary,
-        method=options.method,
-        adjustment="rigid",
-        r_pc=0.5,
-        r_reg=2.0,
-        backend="colmap",
-        features="auto",
-        working_px=1280,
-    )
+    chosen = RunOptions(edge_mm=options.edge_mm, dictionary=options.dictionary, method=options.method)
+    return settings_from(chosen, dense_device(os.environ))
 
 
 def _said(report: Report) -> dict[str, object]:
@@ -109,9 +102,9 @@ def _register(options: Namespace, steps: _Steps) -> dict[str, object]:
 def parsed() -> Namespace:
     """The command line."""
     parser = ArgumentParser()
-    parser.add_argument("--edge-mm", type=float, default=6.8)
-    parser.add_argument("--dictionary", default="DICT_4X4_50")
-    parser.add_argument("--method", default="camera")
+    parser.add_argument("--edge-mm", type=float, default=DEFAULTS.edge_mm)
+    parser.add_argument("--dictionary", default=DEFAULTS.dictionary)
+    parser.add_argument("--method", default=DEFAULTS.method)
     parser.add_argument("--photos", type=Path)
     parser.add_argument("--run", type=Path)
     parser.add_argument("--cube", type=Path)

@@ -11,29 +11,21 @@ from rich.console import Console
 
 from specimap_core.photos.folder import photo_paths
 from specimap_core.pipeline.clock import Clock
+from specimap_core.pipeline.options import RunOptions
 from specimap_core.pipeline.outputs import Outputs
 from specimap_core.pipeline.register_stage import triangulated_edges
 from specimap_core.pipeline.settings import settings_from
 from specimap_core.pipeline.stages import adjust_stage, reconstruct_stage
+from specimap_core.reconstruct.dense.device import dense_device
 
 APPLE = "real_aruco_apple"
 EDGE_MM = 33.0
-WORKING_PX = 1280
 
 
 def bench_apple(console: Console, folder: Path) -> dict[str, object]:
     """42 phone photos of an apple on a printed board: stages 1 and 2."""
-    settings = settings_from(
-        edge_mm=EDGE_MM,
-        dictionary="DICT_7X7_1000",
-        method="camera",
-        adjustment="rigid",
-        r_pc=0.5,
-        r_reg=2.0,
-        backend="colmap",
-        features="auto",
-        working_px=WORKING_PX,
-    )
+    options = RunOptions(edge_mm=EDGE_MM, dictionary="DICT_7X7_1000")
+    settings = settings_from(options, dense_device(os.environ))
     workers = os.cpu_count() or 1
     with tempfile.TemporaryDirectory() as scratch:
         store, clock = Outputs(Path(scratch)).store, Clock(lambda stage, share: None, lambda: False)
@@ -47,7 +39,7 @@ def bench_apple(console: Console, folder: Path) -> dict[str, object]:
     console.print(
         f"{APPLE}: {used} of {given} photos used, {markers} markers, edge {edges.mean:.3f} mm "
         f"(given {EDGE_MM}), spread {100 * edges.std / edges.mean:.2f} %, mesh of {vertices:,} vertices "
-        f"in {seconds:.1f} s at {WORKING_PX} px",
+        f"in {seconds:.1f} s at {options.working_px} px",
         highlight=False,
     )
     return {

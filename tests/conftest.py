@@ -7,6 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from specimap_core.threads import limit_blas_threads
+
+limit_blas_threads()
+
 pytest_plugins = (
     "tests.support.databases",
     "tests.support.scenes",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from enum import StrEnum
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from specimap_cli import run_options
 from specimap_cli.doctor import doctor
 from specimap_cli.errors import Debug, reported_errors, stoppable
 from specimap_cli.keys import keys_app
@@ -18,6 +20,7 @@ from specimap_cli.validation import study_app, validate
 from specimap_core import __version__
 from specimap_core.json_text import json_text
 from specimap_core.photos.formats import NAMES
+from specimap_core.pipeline.options import DEFAULTS, RunOptions
 
 app = typer.Typer(
     add_completion=False,
@@ -25,36 +28,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Photos and one hyperspectral cube of an excised specimen to a metric 3D point cloud with spectra.",
 )
-
-
-class Method(StrEnum):
-    """Registration methods."""
-
-    camera = "camera"
-    homography = "homography"
-
-
-class Adjustment(StrEnum):
-    """Forms of the joint adjustment."""
-
-    rigid = "rigid"
-    free = "free"
-
-
-class Backend(StrEnum):
-    """Reconstruction backends."""
-
-    colmap = "colmap"
-    mast3r = "mast3r"
-    da3 = "da3"
-
-
-class Features(StrEnum):
-    """Features that locate photos which the markers leave open."""
-
-    auto = "auto"
-    sift = "sift"
-    aliked = "aliked"
 
 
 class Format(StrEnum):
@@ -88,21 +61,15 @@ def run(
     out: Annotated[Path, typer.Option(help="Folder for the results; an earlier run's is continued.")],
     white: Annotated[Path | None, typer.Option(help="White reference of the cube, for reflectance.")] = None,
     dark: Annotated[Path | None, typer.Option(help="Dark reference of the cube.")] = None,
-    edge_mm: Annotated[float, typer.Option(help="Edge of a marker's black square, mm.")] = 6.8,
-    dictionary: Annotated[str, typer.Option(help="The markers' ArUco dictionary.")] = "DICT_4X4_50",
-    method: Annotated[Method, typer.Option(help="camera removes parallax; homography is the published one.")] = (
-        Method.camera
-    ),
-    adjustment: Annotated[Adjustment, typer.Option(help="rigid squares, or free corners as published.")] = (
-        Adjustment.rigid
-    ),
-    r_pc: Annotated[float, typer.Option(help="Cell of the fine grid, mm.")] = 0.5,
-    r_reg: Annotated[float, typer.Option(help="Cell of the coarse grid, mm.")] = 2.0,
-    backend: Annotated[Backend, typer.Option(help="Reconstruction backend; docs/backends.md.")] = Backend.colmap,
-    features: Annotated[
-        Features, typer.Option(help="Features that locate photos which the markers leave open.")
-    ] = Features.auto,
-    working_px: Annotated[int, typer.Option(help="Longer side that larger photos are brought to.")] = 1280,
+    edge_mm: run_options.EdgeMm = DEFAULTS.edge_mm,
+    dictionary: run_options.Dictionary = DEFAULTS.dictionary,
+    method: run_options.Method = DEFAULTS.method,
+    adjustment: run_options.Adjustment = DEFAULTS.adjustment,
+    r_pc: run_options.FineCellMm = DEFAULTS.r_pc,
+    r_reg: run_options.CoarseCellMm = DEFAULTS.r_reg,
+    backend: run_options.Backend = DEFAULTS.backend,
+    features: run_options.Features = DEFAULTS.features,
+    working_px: run_options.WorkingPx = DEFAULTS.working_px,
     json_events: Annotated[bool, typer.Option("--json", help="One JSON line per event instead of a bar.")] = False,
     debug: Debug = False,
 ) -> None:
@@ -113,23 +80,27 @@ def run(
         from specimap_core.pipeline.outputs import Inputs, Outputs
         from specimap_core.pipeline.run import run_pipeline
         from specimap_core.pipeline.settings import settings_from
+        from specimap_core.reconstruct.backends.environment import backends_from
 
-        settings = settings_from(
+        options = RunOptions(
             edge_mm=edge_mm,
             dictionary=dictionary,
-            method=method.value,
-            adjustment=adjustment.value,
-            r_pc=r_pc,
             r_reg=r_reg,
-            backend=backend.value,
-            features=features.value,
+            r_pc=r_pc,
             working_px=working_px,
+            backend=backend,
+            features=features,
+            method=method,
+            adjustment=adjustment,
         )
+        backends = backends_from(os.environ, backend)
+        settings = settings_from(options, backends.device)
         with listener:
             report = run_pipeline(
                 Inputs(photos, cube, white, dark),
                 out,
                 settings,
+                backends=backends,
                 progress=listener.progress,
                 cancelled=stop_asked,
             )
@@ -237,8 +208,3 @@ app.command()(validate)
 app.command()(doctor)
 app.add_typer(study_app, name="study")
 app.add_typer(keys_app, name="keys")
-
-
-def main() -> None:
-    """Entry point of the console script."""
-    app()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
@@ -32,7 +33,7 @@ def doctor(
         from specimap_core.reconstruct.backends.doctor import diagnose
         from specimap_core.sandbox import protection
 
-        found, shield = diagnose(), protection()
+        found, shield = diagnose(os.environ), protection()
         if json_events:
             confinement = {**asdict(shield), "whole": shield.whole}
             sys.stdout.write(json_text({"event": "diagnosed", **found.as_dict(), "sandbox": confinement}) + "\n")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,10 +11,12 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from specimap_cli import run_options
 from specimap_cli.errors import Debug, reported_errors, stoppable
 from specimap_cli.progress import Listener, json_listener, progress_listener
 from specimap_core.errors import SettingsError
 from specimap_core.json_text import json_text
+from specimap_core.pipeline.options import DEFAULTS, RunOptions
 
 if TYPE_CHECKING:
     from specimap_validation.tables import Table
@@ -37,8 +40,8 @@ def subsampling(
     out: Annotated[Path, typer.Option(help="Folder for the study; an interrupted one goes on.")],
     seeds: Annotated[int, typer.Option(min=1, max=100, help="Random choices of the photos for each share.")] = 3,
     shares: Annotated[str, typer.Option(help="Shares of the photos, percent.")] = "100,90,80,70,60,50",
-    edge_mm: Annotated[float, typer.Option(help="Edge of a marker's black square, mm.")] = 6.8,
-    dictionary: Annotated[str, typer.Option(help="The markers' ArUco dictionary.")] = "DICT_4X4_50",
+    edge_mm: run_options.EdgeMm = DEFAULTS.edge_mm,
+    dictionary: run_options.Dictionary = DEFAULTS.dictionary,
     json_events: Json = False,
     debug: Debug = False,
 ) -> None:
@@ -46,23 +49,14 @@ def subsampling(
     listener: Listener = json_listener() if json_events else progress_listener()
     with reported_errors(listener, debug), stoppable() as stop_asked:
         from specimap_core.pipeline.settings import settings_from
+        from specimap_core.reconstruct.dense.device import dense_device
         from specimap_validation.capture import find_capture
         from specimap_validation.pages import check_drawing, publish_study
         from specimap_validation.subsampling import Row, study_subsampling
         from specimap_validation.tables import study_table
 
         wanted = _numbers(shares, "shares")
-        settings = settings_from(
-            edge_mm=edge_mm,
-            dictionary=dictionary,
-            method="camera",
-            adjustment="rigid",
-            r_pc=0.5,
-            r_reg=2.0,
-            backend="colmap",
-            features="auto",
-            working_px=1280,
-        )
+        settings = settings_from(RunOptions(edge_mm=edge_mm, dictionary=dictionary), dense_device(os.environ))
         capture = find_capture(acquisition)
         check_drawing()
 

@@ -40,6 +40,12 @@ def open3d() -> ModuleType:
         ) from error
 
 
+def quiet_colmap() -> None:
+    """Keep COLMAP's notes off standard error in this process: it reports every extractor it makes, and every step."""
+    pycolmap = importlib.import_module("pycolmap")
+    pycolmap.logging.minloglevel = pycolmap.logging.WARNING
+
+
 def preload() -> None:
     """Load Open3D in the background: its second of importing hides behind other work; errors come when it is used."""
 

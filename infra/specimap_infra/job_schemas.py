@@ -10,45 +10,37 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from sqlalchemy.orm import Session
 
 from specimap_core.errors import SettingsError
-from specimap_core.pipeline.limits import RANGES
+from specimap_core.pipeline.options import (
+    DEFAULTS,
+    OPTIONS,
+    Adjustment,
+    Backend,
+    Dictionary,
+    Features,
+    Method,
+)
 from specimap_infra.tables import PRIORITIES, Acquisition, CloudRow, Job
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 PriorityName = Literal["intraoperative", "routine", "research"]
-Dictionary = Literal[
-    "DICT_4X4_50",
-    "DICT_4X4_100",
-    "DICT_4X4_250",
-    "DICT_4X4_1000",
-    "DICT_5X5_50",
-    "DICT_5X5_100",
-    "DICT_5X5_250",
-    "DICT_5X5_1000",
-    "DICT_6X6_50",
-    "DICT_6X6_100",
-    "DICT_6X6_250",
-    "DICT_6X6_1000",
-    "DICT_7X7_50",
-    "DICT_7X7_100",
-    "DICT_7X7_250",
-    "DICT_7X7_1000",
-    "DICT_ARUCO_ORIGINAL",
-    "DICT_APRILTAG_16h5",
-    "DICT_APRILTAG_25h9",
-    "DICT_APRILTAG_36h10",
-    "DICT_APRILTAG_36h11",
-    "DICT_ARUCO_MIP_36h12",
-]
-"""OpenCV's predefined dictionaries, named here so that no service needs OpenCV to check a name."""
-EdgeMm = Annotated[
-    float,
-    Field(
-        ge=RANGES["edge_mm"][0],
-        le=RANGES["edge_mm"][1],
-        allow_inf_nan=False,
-        description="Edge of a marker's black square, mm.",
-    ),
-]
+
+
+def _option(name: str, **given: Any) -> Any:
+    """A field that is as the run's option of that name, but for what is ``given``."""
+    option, default = OPTIONS[name], getattr(DEFAULTS, name)
+    rules: dict[str, Any] = {"default": default, "description": option.meaning}
+    if not option.choices:
+        rules |= _bounds(name)
+    return Field(**{**rules, **given})
+
+
+def _bounds(name: str) -> dict[str, Any]:
+    low, high = OPTIONS[name].bounds
+    whole = isinstance(getattr(DEFAULTS, name), int)
+    return {"ge": low, "le": high, **({} if whole else {"allow_inf_nan": False})}
+
+
+EdgeMm = Annotated[float, Field(description=OPTIONS["edge_mm"].meaning, **_bounds("edge_mm"))]
 
 
 class JobSettings(BaseModel):
@@ -56,38 +48,15 @@ class JobSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"example": {"method": "camera", "r_pc": 0.5}})
 
-    method: Literal["camera", "homography"] = Field(
-        default="camera", description="`camera` removes parallax; `homography` is the published one."
+    method: Method = _option("method")
+    adjustment: Adjustment = _option("adjustment")
+    r_pc: float = _option("r_pc")
+    r_reg: float = _option("r_reg")
+    backend: Backend = _option(
+        "backend", description="Reconstruction backend; the learned ones need weights on the worker."
     )
-    adjustment: Literal["rigid", "free"] = Field(
-        default="rigid", description="`rigid` squares, or `free` corners as published."
-    )
-    r_pc: float = Field(
-        default=0.5,
-        ge=RANGES["r_pc"][0],
-        le=RANGES["r_pc"][1],
-        allow_inf_nan=False,
-        description="Cell of the fine grid, mm.",
-    )
-    r_reg: float = Field(
-        default=2.0,
-        ge=RANGES["r_reg"][0],
-        le=RANGES["r_reg"][1],
-        allow_inf_nan=False,
-        description="Cell of the coarse grid, mm.",
-    )
-    backend: Literal["colmap", "mast3r", "da3"] = Field(
-        default="colmap", description="Reconstruction backend; the learned ones need weights on the worker."
-    )
-    features: Literal["auto", "sift", "aliked"] = Field(
-        default="auto", description="Features that locate photos which the markers leave open."
-    )
-    working_px: int = Field(
-        default=1280,
-        ge=RANGES["working_px"][0],
-        le=RANGES["working_px"][1],
-        description="Longer side that larger photos are brought to, pixels.",
-    )
+    features: Features = _option("features")
+    working_px: int = _option("working_px")
     dictionary: Dictionary | None = Field(default=None, description="Marker dictionary; by default the acquisition's.")
     edge_mm: EdgeMm | None = Field(default=None, description="Edge of a marker, mm; by default the acquisition's.")
 

@@ -6,11 +6,11 @@ import os
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field, ValidationError, ValidationInfo, field_validator
+from pydantic import Field, PrivateAttr, ValidationError, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
 
 from specimap_core.errors import SettingsError
-from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES, check_environment
+from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES, backends_from
 from specimap_core.sandbox import Mode
 
 CONFIG_VARIABLE = "SPECIMAP_CONFIG"
@@ -22,6 +22,11 @@ GIB = 1024**3
 def _data_dir() -> Path:
     home = os.environ.get("XDG_DATA_HOME") or str(Path.home() / ".local" / "share")
     return Path(home) / "specimap"
+
+
+def _config_file() -> Path | None:
+    file = os.environ.get(CONFIG_VARIABLE)
+    return Path(file) if file else None
 
 
 class ServiceSettings(BaseSettings):
@@ -120,6 +125,8 @@ class ServiceSettings(BaseSettings):
         default="json", description="One JSON object a line, or lines for a person."
     )
 
+    _config_file: Path | None = PrivateAttr(default_factory=_config_file)
+
     @classmethod
     def settings_customise_sources(
         cls,
@@ -130,9 +137,8 @@ class ServiceSettings(BaseSettings):
         file_secret_settings: PydanticBaseSettingsSource,
     ) -> tuple[PydanticBaseSettingsSource, ...]:
         """Arguments win over the environment, the environment over the file."""
-        file = os.environ.get(CONFIG_VARIABLE)
-        sources = (init_settings, env_settings)
-        return (*sources, TomlConfigSettingsSource(settings_cls, Path(file))) if file else sources
+        file, sources = _config_file(), (init_settings, env_settings)
+        return (*sources, TomlConfigSettingsSource(settings_cls, file)) if file else sources
 
     @field_validator("database_url")
     @classmethod
@@ -180,8 +186,8 @@ class ServiceSettings(BaseSettings):
         if self.database.startswith("sqlite:///"):
             # With its journals, which come and go beside it.
             places.append(Path(self.database.removeprefix("sqlite:///")).parent)
-        if file := os.environ.get(CONFIG_VARIABLE):
-            places.append(Path(file))
+        if self._config_file is not None:
+            places.append(self._config_file)
         return [place.absolute() for place in places]
 
 
@@ -191,8 +197,8 @@ def load_settings(**given: object) -> ServiceSettings:
     Raises:
         SettingsError: a value cannot be; the message names the variable.
     """
-    file = os.environ.get(CONFIG_VARIABLE)
-    if file and not Path(file).is_file():
+    file = _config_file()
+    if file is not None and not file.is_file():
         raise SettingsError(
             f"{CONFIG_VARIABLE} names {file}, which does not exist.",
             advice="Name a TOML file.",
@@ -206,7 +212,7 @@ def load_settings(**given: object) -> ServiceSettings:
             advice="docs/settings.md lists all; correct the name or remove it.",
             setting=strange[0],
         )
-    check_environment()
+    backends_from(os.environ)
     try:
         return ServiceSettings(**given)  # type: ignore[arg-type]
     except ValidationError as error:

@@ -10,7 +10,6 @@ from importlib.metadata import version
 
 import pytest
 
-from bench.__main__ import PARTS
 from bench.growth import (
     DISK_SHARE,
     FACTORS,
@@ -24,6 +23,7 @@ from bench.growth import (
 from bench.machine import OPTIONAL, available_bytes, describe, installed
 from bench.measure import Cost, Measured
 from bench.photos import COUNTS, sheet_photos
+from bench.program import PARTS
 from bench.step_bounds import BOUNDS, Recorded, Recorder, on_threads
 from bench.steps import END, ORDER, REST, START, imports_in, sheet_steps, steps_of
 from bench.synthetic import COLS, ROWS

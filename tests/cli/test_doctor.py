@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import sys
 import time
 from pathlib import Path
@@ -111,7 +112,7 @@ def test_an_interpreter_tells_what_it_imports() -> None:
 def test_one_command_brings_all_missing_modules(bare: pytest.MonkeyPatch) -> None:
     reasons = {"safetensors": "not installed", "torch": "libgomp.so.1 is absent", "einops": "not installed"}
     bare.setattr(availability, "probe", lambda python, modules: {"modules": {}, "missing": reasons})
-    found = next(p for p in availability.diagnose().parts if p.name == "da3")
+    found = next(p for p in availability.diagnose(os.environ).parts if p.name == "da3")
     (missing,) = [m for m in found.missing if "pip install" in m.do]
     assert missing.what == "safetensors, einops: not installed; torch: libgomp.so.1 is absent"
     assert "pip install safetensors einops torch;" in missing.do
@@ -144,7 +145,7 @@ def diagnosis(*, usable: bool, gpus: tuple[dict[str, Any], ...] = (), torch_gpus
 
 
 def test_a_default_backend_that_is_unusable_gives_status_1(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(availability, "diagnose", lambda: diagnosis(usable=False))
+    monkeypatch.setattr(availability, "diagnose", lambda environment: diagnosis(usable=False))
     status, out = ask()
     assert status == 1
     assert "colmap: open3d: no [lib]" in out
@@ -153,7 +154,7 @@ def test_a_default_backend_that_is_unusable_gives_status_1(monkeypatch: pytest.M
 
 
 def test_gpus_and_weights_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(availability, "diagnose", lambda: diagnosis(usable=True, gpus=(GPU,), torch_gpus=1))
+    monkeypatch.setattr(availability, "diagnose", lambda environment: diagnosis(usable=True, gpus=(GPU,), torch_gpus=1))
     monkeypatch.setenv("COLUMNS", "200")
     status, out = ask()
     assert status == 0

@@ -13,11 +13,11 @@ from sqlalchemy.orm import Session
 from specimap_core.errors import NotFoundError, TooFewPhotosError
 from specimap_core.fiducials.detection import dictionary_named
 from specimap_core.photos.reading import AcquisitionSettings
+from specimap_core.pipeline.options import OPTIONS
 from specimap_infra import jobs
 from specimap_infra.completeness import LEAST_PHOTOS, missing
 from specimap_infra.database import Database
 from specimap_infra.errors import JobConflictError, LostLeaseError
-from specimap_infra.job_schemas import Dictionary
 from specimap_infra.tables import FINAL_STATES, JOB_STATES, Delivery, Job, StoredFile
 from tests.support.job_scene import EXECUTOR, acquisition, events, queued_job, row
 
@@ -234,5 +234,5 @@ def test_refused_files_do_not_count(sqlite_tables: Database) -> None:
 
 def test_light_rules_are_the_pipelines() -> None:
     assert AcquisitionSettings().least_photos == LEAST_PHOTOS
-    for name in Dictionary.__args__:  # type: ignore[attr-defined]
+    for name in OPTIONS["dictionary"].choices:
         dictionary_named(name)

@@ -11,7 +11,7 @@ import sqlalchemy as sa
 
 from specimap_infra.database import utc_now
 from specimap_infra.ids import new_id
-from specimap_infra.tables import Base, CloudRow, Job, JobEvent
+from specimap_infra.tables import Acquisition, Base, CloudRow, Job, JobEvent
 from tests.support.places import SAMPLES
 from tests.support.service_scene import Running, serving
 from tests.support.upload_scene import created, new_acquisition, patch, photos, send, sent
@@ -57,6 +57,18 @@ def test_made_and_read(service: Running) -> None:
     assert service.client(["upload"]).get(f"/v1/acquisitions/{made['id']}").json()["code"] == "forbidden"
     assert client.get("/v1/acquisitions/acq_" + "0" * 26).json()["code"] == "not_found"
     assert client.get("/v1/acquisitions/etc").json()["code"] == "request_invalid"
+
+
+def test_an_edge_that_no_job_takes_is_refused_and_one_stored_earlier_is_still_read(service: Running) -> None:
+    client = service.client()
+    for edge in (0.3, 250):
+        refused = client.post("/v1/acquisitions", json={"specimen_id": "a", "edge_mm": edge})
+        assert (refused.status_code, refused.json()["code"]) == (422, "request_invalid")
+    made = new_acquisition(client)
+    with service.database.session() as session:
+        session.get_one(Acquisition, made).edge_mm = 250.0
+    assert client.get(f"/v1/acquisitions/{made}").json()["edge_mm"] == 250.0
+    assert [one["edge_mm"] for one in client.get("/v1/acquisitions").json()["items"]] == [250.0]
 
 
 @pytest.mark.parametrize(

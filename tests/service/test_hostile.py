@@ -38,7 +38,7 @@ NAIVE = """
 import glob, json, sys
 from pathlib import Path
 import h5py, numpy as np, tifffile
-from specimap_core.screening import __main__ as child
+from specimap_core.screening import process as child
 from specimap_core.screening.verdict import Verdict
 
 def whole(task):
@@ -287,7 +287,7 @@ def test_an_answer_is_shortened_and_its_wavelengths_are_plausible() -> None:
 
 POISON = """
 import json, os, signal, sys
-from specimap_core.screening import __main__ as child
+from specimap_core.screening import process as child
 from specimap_core.screening.verdict import Verdict
 
 def poison(task):
@@ -316,7 +316,7 @@ child.main()
 
 
 def test_a_file_costs_its_own_copy_and_no_other_files_answer(tmp_path: Path) -> None:
-    judge = Judge(load_settings(data_dir=tmp_path / "data"), (sys.executable, "-c", POISON))
+    judge = Judge(load_settings(data_dir=tmp_path / "data"), os.environ, (sys.executable, "-c", POISON))
     folder = tmp_path / "task"
     folder.mkdir()
     try:
@@ -334,7 +334,7 @@ def test_a_file_costs_its_own_copy_and_no_other_files_answer(tmp_path: Path) -> 
 
 
 def test_a_copy_that_ends_while_it_waits_is_no_fault_of_the_next_file(tmp_path: Path) -> None:
-    judge = Judge(load_settings(data_dir=tmp_path / "data"), (sys.executable, "-c", POISON))
+    judge = Judge(load_settings(data_dir=tmp_path / "data"), os.environ, (sys.executable, "-c", POISON))
     folder = tmp_path / "task"
     folder.mkdir()
     try:

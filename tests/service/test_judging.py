@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from specimap_core.errors import BackendUnavailableError
 from specimap_core.photos.reading import AcquisitionSettings, read_photo
+from specimap_core.pipeline.options import Dictionary
 from specimap_core.screening.photo import Others, judge_photo
 from specimap_infra.completeness import LEAST_PHOTOS
 from specimap_infra.settings import load_settings
 from specimap_service.acquisitions.judge import Judge
-from specimap_service.acquisitions.schemas import Dictionary
 from tests.support.photo_files import bomb
 from tests.support.service_scene import Running
 from tests.support.upload_scene import client_at, key_in, new_acquisition, photos, process_serving, send, sent
@@ -185,7 +185,7 @@ for line in sys.stdin:
 
 @pytest.fixture
 def fake(tmp_path: Path) -> Iterator[Judge]:
-    judge = Judge(load_settings(data_dir=tmp_path, judge_seconds=0.5), (sys.executable, "-c", FAKE))
+    judge = Judge(load_settings(data_dir=tmp_path, judge_seconds=0.5), os.environ, (sys.executable, "-c", FAKE))
     yield judge
     judge.close()
 
@@ -215,7 +215,7 @@ def test_child_outlives_the_thread_that_asked_and_comes_back_when_killed(fake: J
 
 
 def test_a_child_that_does_not_start_is_no_fault_of_the_file(tmp_path: Path) -> None:
-    judge = Judge(load_settings(data_dir=tmp_path), (sys.executable, "-c", "raise SystemExit(3)"))
+    judge = Judge(load_settings(data_dir=tmp_path), os.environ, (sys.executable, "-c", "raise SystemExit(3)"))
     with pytest.raises(BackendUnavailableError, match="does not start"):
         judge.cube(Path("good"))
     judge.close()

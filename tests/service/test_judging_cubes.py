@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import threading
 from pathlib import Path
 from typing import Any
@@ -197,7 +198,7 @@ def mutated(text: bytes, rng: np.random.Generator) -> bytes:
 def test_a_thousand_hostile_cubes(tmp_path: Path) -> None:
     settings = load_settings(data_dir=tmp_path, judge_seconds=10, judge_memory_bytes=256 * 1024**2)
     settings.scratch.mkdir(parents=True)
-    judge = Judge(settings)
+    judge = Judge(settings, os.environ)
     rng = np.random.default_rng(0)
     header = write_envi(tmp_path / "cube.hdr", random_values("u2", (12, 10, 6)), wavelength="{1,2,3,4,5,6}")
     text, data = header.read_bytes(), header.with_suffix(".raw").read_bytes()

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
 import sys
 
 from specimap_core.errors import SpecimapError
+from specimap_core.reconstruct.backends.environment import backends_from
 from specimap_core.sandbox import hide_from_others
 from specimap_core.sandbox.lifetime import die_with
 from specimap_infra.database import Database
@@ -37,7 +39,7 @@ def main() -> int:
         from specimap_workers.worker import Worker
 
         command = shlex.split(options.stage_command) if options.stage_command else COMMAND
-        Worker(settings, slot=options.slot, kind=options.kind, command=command).run()
+        Worker(settings, backends_from(os.environ), slot=options.slot, kind=options.kind, command=command).run()
     except SpecimapError as error:
         logger().error("worker cannot work", code=error.code, message=error.message, advice=error.advice)
         return 2

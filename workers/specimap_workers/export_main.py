@@ -8,14 +8,13 @@ import resource
 import signal
 import sys
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
-from specimap_core.cloud import Cloud
 from specimap_core.errors import SpecimapError
-from specimap_core.export import ExportFormat, export_cloud
-from specimap_core.export.archive import write_envi_zip, write_zarr_zip
-from specimap_core.export.formats import FileFormat
-from specimap_core.json_text import json_text
+from specimap_core.threads import limit_blas_threads
+
+if TYPE_CHECKING:
+    from specimap_core.export import ExportFormat
 
 PR_SET_PDEATHSIG = 1
 REFUSED = 2
@@ -30,6 +29,12 @@ def make_export_file(cloud_folder: Path, format: str, target: Path) -> Path:
         ValueError: there is no such format.
         SpecimapError: as the format's own writer.
     """
+    # Imported late, since they load numpy.
+    from specimap_core.cloud import Cloud
+    from specimap_core.export import export_cloud
+    from specimap_core.export.archive import write_envi_zip, write_zarr_zip
+    from specimap_core.export.formats import FileFormat
+
     match FileFormat(format):
         case FileFormat.MESH_PLY | FileFormat.MESH_STL | FileFormat.MESH_OBJ | FileFormat.MESH_GLB as mesh:
             from specimap_core.surface.mesh_files import export_mesh, read_mesh_ply, write_mesh_ply
@@ -45,11 +50,12 @@ def make_export_file(cloud_folder: Path, format: str, target: Path) -> Path:
         case (
             FileFormat.PLY | FileFormat.LAS | FileFormat.NPZ | FileFormat.CSV | FileFormat.HTML | FileFormat.PDF
         ) as other:
-            return export_cloud(Cloud.open(cloud_folder / "cloud.zarr"), target, cast(ExportFormat, other.value))
+            return export_cloud(Cloud.open(cloud_folder / "cloud.zarr"), target, cast("ExportFormat", other.value))
 
 
 def main(arguments: list[str]) -> int:
     """The process's own part: folder, format, target, the parent's id, most bytes of memory (0: no limit)."""
+    limit_blas_threads()
     folder, format, target, parent, memory = arguments
     ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != int(parent):  # it ended before the line above
@@ -69,6 +75,8 @@ def main(arguments: list[str]) -> int:
         )
     else:
         return 0
+    from specimap_core.json_text import json_text
+
     with answer:
         answer.write(json_text(refused.as_dict()))
     return REFUSED

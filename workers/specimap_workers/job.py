@@ -16,6 +16,7 @@ from specimap_core.atomic import disk_errors, remove
 from specimap_core.errors import SpecimapError
 from specimap_core.pipeline.clock import STAGES
 from specimap_core.pipeline.outputs import prepare_folder
+from specimap_core.reconstruct.backends.environment import BackendSettings
 from specimap_core.report.model import Report
 from specimap_infra import jobs
 from specimap_infra.database import Database
@@ -50,6 +51,7 @@ class JobRun:
         storage: Storage,
         settings: ServiceSettings,
         processes: Processes,
+        backends: BackendSettings,
     ) -> None:
         self.job_id = job_id
         self.executor = executor
@@ -57,6 +59,7 @@ class JobRun:
         self._storage = storage
         self._settings = settings
         self._processes = processes
+        self._backends = backends
         self.folder = work_folder(settings.scratch, job_id, executor)
         self._inputs, self._out = self.folder / "inputs", self.folder / "out"
         self._plan: Plan | None = None
@@ -268,7 +271,7 @@ class JobRun:
 
     async def _planned(self) -> Plan:
         if self._plan is None:
-            self._plan = await self._thread(plan_of, self._database, self.job_id)
+            self._plan = await self._thread(plan_of, self._database, self.job_id, self._backends)
         return self._plan
 
     def _artefacts(self, plan: Plan) -> Artefacts:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +12,12 @@ import sqlalchemy as sa
 from specimap_core.errors import NotFoundError
 from specimap_core.json_text import json_text
 from specimap_core.pipeline.keys import digest_of, register_key, surface_keys
+from specimap_core.pipeline.options import RunOptions
 from specimap_core.pipeline.settings import settings_from
+from specimap_core.reconstruct.backends.environment import BackendSettings
 from specimap_infra.database import Database
 from specimap_infra.storage import Storage
 from specimap_infra.tables import Acquisition, Job, StoredFile
-
-DEFAULTS: dict[str, Any] = {
-    "method": "camera",
-    "adjustment": "rigid",
-    "r_pc": 0.5,
-    "r_reg": 2.0,
-    "backend": "colmap",
-    "features": "auto",
-    "working_px": 1280,
-}
 
 
 @dataclass(frozen=True)
@@ -60,8 +52,8 @@ class Plan:
                 storage.fetch(key, folder / place)
 
 
-def plan_of(database: Database, job_id: str) -> Plan:
-    """The plan of a job.
+def plan_of(database: Database, job_id: str, backends: BackendSettings) -> Plan:
+    """The plan of a job on a machine with these backends.
 
     Raises:
         NotFoundError: the job, or its acquisition's cube or photos, are gone.
@@ -82,21 +74,17 @@ def plan_of(database: Database, job_id: str) -> Plan:
     cube = {row.label: row.sha256 for row in rows if row.role != "photo"}
     if not photos or not any(row.role == "cube" for row in rows):
         raise NotFoundError("The acquisition's photos or its cube are gone.", advice="Upload them, then rerun the job.")
-    chosen = {
-        **DEFAULTS,
-        "edge_mm": acquisition.edge_mm,
-        "dictionary": acquisition.dictionary,
-        **{name: value for name, value in job.settings.items() if value is not None},
-    }
-    settings = settings_from(**chosen)
-    keys = surface_keys(photos, settings)
+    chosen: dict[str, Any] = {name: value for name, value in job.settings.items() if value is not None}
+    options = RunOptions(**{"edge_mm": acquisition.edge_mm, "dictionary": acquisition.dictionary, **chosen})
+    settings = settings_from(options, backends.device)
+    keys = surface_keys(photos, settings, backends)
     digest = hashlib.sha256(json_text(cube, sort_keys=True).encode()).hexdigest()
     keys["register"] = register_key(keys["render"], digest, settings)
     return Plan(
         job.id,
         acquisition.id,
         files,
-        chosen,
+        asdict(options),
         keys,
         {"cube": digest, "photos": digest_of(photos), "acquisition": acquisition.id, "job": job.id},
     )

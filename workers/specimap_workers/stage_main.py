@@ -14,11 +14,14 @@ import sys
 from pathlib import Path
 from typing import Any, TextIO
 
-from specimap_core.json_text import json_text
 from specimap_core.sandbox.lifetime import die_with
+from specimap_core.threads import limit_blas_threads
 
 
 def _say(out: TextIO, **event: object) -> None:
+    # Imported late, since it loads numpy.
+    from specimap_core.json_text import json_text
+
     out.write(json_text(event) + "\n")
     out.flush()
 
@@ -34,21 +37,26 @@ def _load() -> None:
 
 
 def _run(spec: dict[str, Any], out: TextIO) -> None:
+    from specimap_core.pipeline.options import RunOptions
     from specimap_core.pipeline.outputs import Inputs
     from specimap_core.pipeline.settings import settings_from
     from specimap_core.pipeline.single_stage import StageRun, run_stage
+    from specimap_core.reconstruct.backends.environment import backends_from
 
+    options = RunOptions(**spec["settings"])
+    backends = backends_from(os.environ, options.backend)
     paths = {name: Path(path) for name, path in spec["inputs"].items()}
     run = StageRun(
         spec["stage"],
         Inputs(**paths),
         Path(spec["out"]),
-        settings_from(**spec["settings"]),
+        settings_from(options, backends.device),
         spec["keys"],
         spec["seconds"],
         spec["reused"],
         spec["hashes"],
         spec["workers"],
+        backends,
     )
     seconds = run_stage(run, progress=lambda stage, share: _say(out, event="progress", stage=stage, share=share))
     _say(out, event="done", seconds=seconds)
@@ -56,6 +64,7 @@ def _run(spec: dict[str, Any], out: TextIO) -> None:
 
 def main() -> None:
     """Serve one stage. Arguments: the most address space it may take, 0 for any, and the parent's process id."""
+    limit_blas_threads()
     memory_bytes, parent = (int(value) for value in sys.argv[1:3])
     die_with(parent)
     # Libraries that print would break the lines that the worker reads.

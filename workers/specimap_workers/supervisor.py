@@ -68,7 +68,7 @@ class Supervisor:
                 if self._stopping.is_set():
                     return
                 # In a session of its own: Ctrl-C reaches the parent alone, which then ends the children in order.
-                child = self._children[slot] = subprocess.Popen(command, start_new_session=True, env=os.environ)
+                child = self._children[slot] = subprocess.Popen(command, start_new_session=True)
             status = child.wait()
             if self._stopping.is_set():
                 return

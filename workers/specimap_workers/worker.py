@@ -17,6 +17,7 @@ from dbos import DBOS, DBOSConfig
 
 from specimap_core.atomic import remove
 from specimap_core.errors import SpecimapError
+from specimap_core.reconstruct.backends.environment import BackendSettings
 from specimap_infra.database import Database
 from specimap_infra.errors import LostLeaseError
 from specimap_infra.logs import logger
@@ -49,13 +50,20 @@ class Worker:
     """Everything one worker process holds."""
 
     def __init__(
-        self, settings: ServiceSettings, *, slot: int = 0, kind: str = "cpu", command: Sequence[str] = COMMAND
+        self,
+        settings: ServiceSettings,
+        backends: BackendSettings,
+        *,
+        slot: int = 0,
+        kind: str = "cpu",
+        command: Sequence[str] = COMMAND,
     ) -> None:
         self.settings = settings
+        self._backends = backends
         self.executor = f"{socket.gethostname()}:{slot}:{uuid.uuid4().hex[:12]}"
         self._database = Database.open(settings.database)
         self._storage = Storage.open(settings)
-        cells = Cells.of(settings, settings.scratch / "work", self._suffix)
+        cells = Cells.of(settings, settings.scratch / "work", self._suffix, backends)
         self._processes = Processes(cells, command, memory_bytes=settings.stage_memory_bytes)
         self._kind = kind
         self._stopping = threading.Event()
@@ -184,6 +192,7 @@ class Worker:
             storage=self._storage,
             settings=self.settings,
             processes=self._processes,
+            backends=self._backends,
         )
 
     def _sweep(self) -> None:

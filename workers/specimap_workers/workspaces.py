@@ -9,14 +9,13 @@ from __future__ import annotations
 import os
 import stat
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from specimap_core.atomic import disk_errors, remove
-from specimap_core.reconstruct.backends.da3 import settings as da3
-from specimap_core.reconstruct.backends.mast3r import settings as mast3r
+from specimap_core.reconstruct.backends.environment import UNCONFIGURED, BackendSettings
 from specimap_core.sandbox import Mode, Reach, confined
 from specimap_core.sandbox.environment import bare_environment
 from specimap_core.sandbox.places import interpreter_places
@@ -76,11 +75,14 @@ class Cells:
     suffix: str
     mode: Mode
     private: Sequence[Path]
+    backends: BackendSettings = UNCONFIGURED
 
     @classmethod
-    def of(cls, settings: ServiceSettings, folder: Path, suffix: str) -> Cells:
+    def of(
+        cls, settings: ServiceSettings, folder: Path, suffix: str, backends: BackendSettings = UNCONFIGURED
+    ) -> Cells:
         """As the settings say."""
-        return cls(folder, suffix, settings.sandbox, settings.private_places)
+        return cls(folder, suffix, settings.sandbox, settings.private_places, backends)
 
     def new(self, name: str = "") -> Cell:
         """An empty cell; of a name that is not there yet, or none."""
@@ -91,8 +93,8 @@ class Cells:
         return cell
 
     def confined(self, command: Sequence[str], cell: Cell, *, backends: bool) -> list[str]:
-        """The command, which reaches the cell alone, and with ``backends`` what the environment names of these."""
-        more = backend_reach() if backends and self.mode != "off" else Reach()
+        """The command, which reaches the cell alone, and with ``backends`` what the settings name of these."""
+        more = backend_reach(self.backends) if backends and self.mode != "off" else Reach()
         reach = Reach((*more.read, cell.given), (*more.write, cell.own, cell.scratch), more.run, self.private)
         return confined(command, reach, self.mode)
 
@@ -101,13 +103,9 @@ class Cells:
         return {**bare_environment(keep), "TMPDIR": str(cell.scratch)}
 
 
-def backend_reach(environment: Mapping[str, str] = os.environ) -> Reach:
-    """What the environment names for backends with a network: checkouts, weights, interpreters, and MASt3R's cache.
-
-    Raises:
-        SettingsError: a value cannot be.
-    """
-    first, second = mast3r.settings_from_environment(environment), da3.settings_from_environment(environment)
+def backend_reach(backends: BackendSettings) -> Reach:
+    """What is named for backends with a network: checkouts, weights, interpreters, and MASt3R's cache."""
+    first, second = backends.mast3r, backends.da3
     run = [path for path in (first.home, second.home) if path is not None]
     for python in (first.python, second.python):
         run += interpreter_places(python) if python else []

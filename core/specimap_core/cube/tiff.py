@@ -31,8 +31,6 @@ _GDAL_METADATA, _GDAL_NODATA = 42112, 42113
 _GDAL_ITEM = re.compile(r"<Item\b[^>]*\bsample=\"(\d+)\"[^>]*>([^<]*)</Item>")
 # CF's words, which mean the same.
 _GAINS, _OFFSETS = "scale_factor", "add_offset"
-# It prints what it thinks of odd tags to the user's terminal, such as GDAL's own no-data value of float32.
-logging.getLogger("tifffile").setLevel(logging.CRITICAL)
 _MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 # What tifffile itself writes, and what is read of the one file alone. Anything else of its kinds is read as plain
 # pages; asking the library for its list leaves out no kind that it may learn.
@@ -94,6 +92,8 @@ class TiffFormat:
 
 @contextmanager
 def _opened(path: Path, **kinds: bool) -> Iterator[tifffile.TiffFile]:
+    # It prints what it thinks of odd tags to the user's terminal, such as GDAL's own no-data value of float32.
+    logging.getLogger("tifffile").setLevel(logging.CRITICAL)
     with open(path, "rb") as stream, tifffile.TiffFile(stream, _multifile=False, **_ONE_FILE | kinds) as file:
         yield file
 

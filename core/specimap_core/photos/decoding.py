@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import io
 import math
@@ -17,13 +18,8 @@ from specimap_core.atomic import name_as_text
 from specimap_core.errors import PhotoRawError, PhotoUnreadableError
 from specimap_core.photos.formats import FORMATS, NAMES, RAW_SUFFIXES, suffix_of
 
-register_heif_opener()
-
 LARGEST_PHOTO_PIXELS = 250_000_000
 LARGEST_PHOTO_BYTES = 1_600_000_000
-# Pillow's own limit warns at 90 million pixels, which phones exceed, and on standard error; photos are judged by
-# the limit above before they are decoded.
-Image.MAX_IMAGE_PIXELS = None
 QUARTER_TURNS = {3: 2, 4: 2, 5: 1, 6: 1, 7: 3, 8: 3}
 """Clockwise quarter turns by which an EXIF orientation is turned upright."""
 TURNED_BY_READER = ("TIFF", "HEIF")
@@ -41,6 +37,16 @@ SENSOR_PHOTOMETRICS = (32803, 34892)
 """A colour filter's mosaic, and linear sensor values."""
 SAME_FOCAL = 1.08
 """Ratio up to which focal lengths are of one lens: a phone that refocuses zooms by about a per cent."""
+
+
+@functools.cache
+def set_up_pillow() -> None:
+    """Let Pillow read HEIF, and leave the judging of sizes to :data:`LARGEST_PHOTO_PIXELS`, for the whole process.
+
+    Pillow's own limit warns at 90 million pixels, which phones exceed, and on standard error.
+    """
+    register_heif_opener()
+    Image.MAX_IMAGE_PIXELS = None
 
 
 @dataclass(frozen=True)
@@ -93,6 +99,7 @@ def photo_suffix(path: Path) -> str:
     Raises:
         PhotoUnreadableError: it is of no known image format.
     """
+    set_up_pillow()
     try:
         with Image.open(path, formats=tuple(FORMATS)) as opened:
             return suffix_of(opened.format)
@@ -113,6 +120,7 @@ def decode_photo(path: Path, least_px: int) -> Decoded:
     if path.suffix.lower() in RAW_SUFFIXES:
         raise _raw(path)
     data = _bytes_of(path)
+    set_up_pillow()
     try:
         with Image.open(io.BytesIO(data), formats=tuple(FORMATS)) as opened:
             return _decoded(opened, path, data, least_px)

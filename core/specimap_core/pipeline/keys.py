@@ -9,19 +9,20 @@ from dataclasses import asdict
 from specimap_core.json_text import json_text
 from specimap_core.pipeline.artefacts import key_of
 from specimap_core.pipeline.settings import PipelineSettings
-from specimap_core.reconstruct.backends.environment import backend_identity
+from specimap_core.reconstruct.backends.environment import UNCONFIGURED, BackendSettings, backend_identity
 
 
-def surface_keys(photos: Mapping[str, str], settings: PipelineSettings) -> dict[str, str]:
+def surface_keys(
+    photos: Mapping[str, str], settings: PipelineSettings, backends: BackendSettings = UNCONFIGURED
+) -> dict[str, str]:
     """Keys of the stages that the cube has no part in; ``photos``: names with the hashes of the files.
 
-    A backend with a network adds its variables and the hash of its weights, so it is to be called where these are.
+    A backend with a network adds its settings and the hash of its weights, so it is to be called where these are.
 
     Raises:
         BackendUnavailableError: that backend's code or weights are not there.
-        SettingsError: one of its variables has a value that cannot be.
     """
-    identity = backend_identity(settings.reconstruct.backend)
+    identity = backend_identity(settings.reconstruct.backend, backends)
     reconstruct = key_of(
         "reconstruct",
         {

@@ -15,6 +15,7 @@ from specimap_core.pipeline.clock import STAGES, Clock, Progress
 from specimap_core.pipeline.keys import digest_of, register_key, surface_keys
 from specimap_core.pipeline.outputs import Inputs, Outputs, prepare_folder
 from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.reconstruct.backends.environment import UNCONFIGURED, BackendSettings
 from specimap_core.report.model import Report
 
 
@@ -23,6 +24,7 @@ def run_pipeline(
     out: Path,
     settings: PipelineSettings,
     *,
+    backends: BackendSettings = UNCONFIGURED,
     progress: Progress = lambda stage, share: None,
     cancelled: Callable[[], bool] = lambda: False,
     workers: int | None = None,
@@ -51,9 +53,18 @@ def run_pipeline(
         remarks = [*cube.warnings, *inspect(cube, mean), *photo_folder(inputs.photos).remarks()]
         with ThreadPoolExecutor(workers) as pool:
             digests = {p.name: d for p, d in zip(paths, pool.map(_digest, paths), strict=True)}
-        keys, store = surface_keys(digests, settings), outputs.store
+        keys, store = surface_keys(digests, settings, backends), outputs.store
         kept = load_stage2(store, keys["adjust"])
-        stage1 = reconstruct_stage(paths, settings, store, keys["reconstruct"], clock, workers, with_depth=kept is None)
+        stage1 = reconstruct_stage(
+            paths,
+            settings,
+            store,
+            keys["reconstruct"],
+            clock,
+            workers,
+            with_depth=kept is None,
+            backends=backends,
+        )
         stage2 = adjust_stage(stage1, settings, store, keys["adjust"], clock, workers, kept)
         # A cube of a gigabyte comes next; the depth maps have done their work.
         stage1 = stage1.without_depth()

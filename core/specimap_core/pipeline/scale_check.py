@@ -8,7 +8,7 @@ import numpy as np
 
 from specimap_core.errors import EdgeImplausibleError, SettingsError
 from specimap_core.geometry.cameras import Floats, Pose
-from specimap_core.pipeline.limits import OTHER_UNITS, RANGES
+from specimap_core.pipeline.options import OPTIONS, OTHER_UNITS
 from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.render.orthographic import LARGEST_GRID_CELLS
 
@@ -47,7 +47,7 @@ def check_scale(
         # A single marker spans nothing; what is wrong then is told where the cube's markers are counted.
         coarse = len(corners) > 1 and max(width, height) < LEAST_CELLS * cell
         if coarse or width * height > LARGEST_GRID_CELLS * cell**2:
-            finest = max(RANGES[name][0], float(np.sqrt(width * height / LARGEST_GRID_CELLS)))
+            finest = max(OPTIONS[name].bounds[0], float(np.sqrt(width * height / LARGEST_GRID_CELLS)))
             raise SettingsError(
                 f"{name} is {cell:g} mm, and the markers span {width:.0f} x {height:.0f} mm.",
                 advice=f"Give {name} from {finest:.2g} to {max(width, height) / LEAST_CELLS:.2g} mm.",

@@ -5,23 +5,22 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, replace
 from typing import cast
 
-from specimap_core.bundle_adjust.adjust import AdjustSettings, Form
-from specimap_core.errors import SettingsError
+from specimap_core.bundle_adjust.adjust import AdjustSettings
 from specimap_core.fiducials.detection import dictionary_named
 from specimap_core.photos.reading import AcquisitionSettings
-from specimap_core.pipeline.limits import RANGES, advice_on
-from specimap_core.reconstruct.backend import FeatureChoice, ReconstructSettings
-from specimap_core.reconstruct.dense.depth_map import DepthSettings, Device
-from specimap_core.reconstruct.dense.device import DEVICES, dense_device
-from specimap_core.register.placement import Method, RegisterSettings
+from specimap_core.pipeline.options import Backend, RunOptions, check_choice, check_number
+from specimap_core.reconstruct.backend import ReconstructSettings
+from specimap_core.reconstruct.dense.depth_map import DepthSettings
+from specimap_core.reconstruct.dense.device import DEVICES, Device
+from specimap_core.register.placement import RegisterSettings
 from specimap_core.render.orthographic import RenderSettings
 from specimap_core.surface.fusion import SurfaceSettings
 from specimap_core.surface.refinement import RefineSettings
 
-BACKENDS = ("colmap", "mast3r", "da3")
 WITH_OWN_CAMERAS = ("mast3r",)
 """Backends that find cameras without the markers."""
-FEATURES = ("auto", "sift", "aliked")
+VOXEL_MM = (0.005, 50.0)
+"""Least and largest edge of a fusion voxel."""
 
 
 @dataclass(frozen=True)
@@ -44,33 +43,25 @@ class PipelineSettings:
             UnknownDictionaryError: there is no such marker dictionary.
         """
         dictionary_named(self.reconstruct.dictionary)
-        numbers: dict[str, float | None] = {
-            "edge_mm": self.adjust.edge_mm,
-            "r_reg": self.render.r_reg_mm,
-            "r_pc": self.render.r_pc_mm,
-            "working_px": self.acquisition.working_px,
-            "voxel_mm": self.surface.voxel_mm,
-        }
-        for name, value in numbers.items():
-            low, high = RANGES[name]
-            if value is not None and not low <= value <= high:
-                raise SettingsError(
-                    f"{name} is {value:g}; it must be from {low:g} to {high:g}.",
-                    advice=advice_on(name, value),
-                    setting=name,
-                )
-        choices = {
-            "backend": (self.reconstruct.backend, BACKENDS),
-            "features": (self.reconstruct.features, FEATURES),
-            "device": (self.reconstruct.depth.device, DEVICES),
-            "method": (self.register.method, ("camera", "homography")),
-            "adjustment": (self.adjust.form, ("rigid", "free")),
-        }
-        for name, (chosen, known) in choices.items():
-            if chosen not in known:
-                raise SettingsError(
-                    f"There is no {name} {chosen!r}.", advice=f"Choose one of: {', '.join(known)}.", setting=name
-                )
+        self.options.check()
+        if self.surface.voxel_mm is not None:
+            check_number("voxel_mm", self.surface.voxel_mm, VOXEL_MM)
+        check_choice("device", self.reconstruct.depth.device, DEVICES)
+
+    @property
+    def options(self) -> RunOptions:
+        """The choices of a person that these settings hold."""
+        return RunOptions(
+            edge_mm=self.adjust.edge_mm,
+            dictionary=self.reconstruct.dictionary,
+            r_reg=self.render.r_reg_mm,
+            r_pc=self.render.r_pc_mm,
+            working_px=self.acquisition.working_px,
+            backend=cast(Backend, self.reconstruct.backend),
+            features=self.reconstruct.features,
+            method=self.register.method,
+            adjustment=self.adjust.form,
+        )
 
     def for_stage1(self) -> ReconstructSettings:
         """Stage 1's settings with what stage 2's say to it: the edge, and for whom the cameras are.
@@ -86,35 +77,24 @@ class PipelineSettings:
         return asdict(replace(self, reconstruct=self.for_stage1()))
 
 
-def settings_from(
-    *,
-    edge_mm: float,
-    dictionary: str,
-    method: str,
-    adjustment: str,
-    r_pc: float,
-    r_reg: float,
-    backend: str,
-    features: str,
-    working_px: int,
-) -> PipelineSettings:
-    """Settings of a run from the few that a person chooses, checked; the environment names the device for dense stereo.
+def settings_from(options: RunOptions, device: Device = "auto") -> PipelineSettings:
+    """Settings of a run from what a person chooses and the ``device`` that depth is measured on; checked.
 
     Raises:
         SettingsError, UnknownDictionaryError: see :meth:`PipelineSettings.check`.
     """
     settings = PipelineSettings(
-        acquisition=AcquisitionSettings(working_px=working_px),
+        acquisition=AcquisitionSettings(working_px=options.working_px),
         reconstruct=ReconstructSettings(
-            dictionary=dictionary,
-            edge_mm=edge_mm,
-            backend=backend,
-            features=cast(FeatureChoice, features),
-            depth=DepthSettings(device=cast(Device, dense_device())),
+            dictionary=options.dictionary,
+            edge_mm=options.edge_mm,
+            backend=options.backend,
+            features=options.features,
+            depth=DepthSettings(device=device),
         ),
-        adjust=AdjustSettings(form=cast(Form, adjustment), edge_mm=edge_mm),
-        render=RenderSettings(r_reg_mm=r_reg, r_pc_mm=r_pc),
-        register=RegisterSettings(method=cast(Method, method)),
+        adjust=AdjustSettings(form=options.adjustment, edge_mm=options.edge_mm),
+        render=RenderSettings(r_reg_mm=options.r_reg, r_pc_mm=options.r_pc),
+        register=RegisterSettings(method=options.method),
     )
     settings.check()
     return settings

@@ -14,6 +14,7 @@ from specimap_core.pipeline.clock import Clock, Progress
 from specimap_core.pipeline.failures import told_as_stage_failure
 from specimap_core.pipeline.outputs import Inputs, Outputs, prepare_folder
 from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.reconstruct.backends.environment import UNCONFIGURED, BackendSettings
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ class StageRun:
     reused: Sequence[str] = ()
     hashes: Mapping[str, str] = field(default_factory=dict)
     workers: int = 1
+    backends: BackendSettings = UNCONFIGURED
 
 
 def run_stage(run: StageRun, *, progress: Progress, cancelled: Callable[[], bool] = lambda: False) -> float:
@@ -65,6 +67,7 @@ def _reconstruct(run: StageRun, clock: Clock) -> None:
         clock,
         run.workers,
         with_depth=False,
+        backends=run.backends,
     )
 
 

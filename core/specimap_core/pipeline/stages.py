@@ -28,6 +28,7 @@ from specimap_core.pipeline.clock import Clock
 from specimap_core.pipeline.scale_check import check_scale
 from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.reconstruct.backend import ReconstructionBackend, corners_in_photos, detect_in_photos
+from specimap_core.reconstruct.backends.environment import UNCONFIGURED, BackendSettings
 from specimap_core.reconstruct.backends.requirements import check_required
 from specimap_core.reconstruct.dense.depth_map import DepthMap
 from specimap_core.reconstruct.dense.volume import volume_over
@@ -45,16 +46,16 @@ VOXEL_PIXELS = 1.4
 GRID_MARGIN_MM = 4.0
 
 
-def backend_named(name: str) -> ReconstructionBackend:
+def backend_named(name: str, backends: BackendSettings) -> ReconstructionBackend:
     """The backend of that name; settings have been checked."""
     if name == "mast3r":
         from specimap_core.reconstruct.backends.mast3r.backend import Mast3rBackend
 
-        return Mast3rBackend()
+        return Mast3rBackend(backends.mast3r)
     if name == "da3":
         from specimap_core.reconstruct.backends.da3.backend import Da3Backend
 
-        return Da3Backend()
+        return Da3Backend(backends.da3)
     from specimap_core.reconstruct.backends.colmap import ColmapBackend
 
     return ColmapBackend()
@@ -69,6 +70,7 @@ def reconstruct_stage(
     workers: int,
     *,
     with_depth: bool = True,
+    backends: BackendSettings = UNCONFIGURED,
 ) -> Stage1:
     """Stage 1, or what an earlier run left of it, then ``with_depth`` maps or without."""
     with clock.stage("reconstruct") as progress:
@@ -76,8 +78,8 @@ def reconstruct_stage(
         if found is not None:
             clock.reused.append("reconstruct")
             return found
-        check_required(settings.reconstruct)
-        backend = backend_named(settings.reconstruct.backend)
+        check_required(settings.reconstruct, backends)
+        backend = backend_named(settings.reconstruct.backend, backends)
         preload()
         photos, refused = read_photos(
             paths, settings.acquisition, workers=workers, progress=lambda s: progress(0.08 * s)

@@ -15,6 +15,7 @@ import pycolmap
 from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
 from specimap_core.geometry.colmap_cameras import colmap_camera, colmap_from_opencv
 from specimap_core.geometry.triangulation import triangulate_pair
+from specimap_core.native import quiet_colmap
 from specimap_core.photos.reading import Photo
 from specimap_core.reconstruct.dense.depth_map import DepthSettings
 from specimap_core.reconstruct.dense.pairs import choose_pairs
@@ -62,6 +63,7 @@ class Locator:
         *,
         least_inliers: int = 0,
     ) -> None:
+        quiet_colmap()
         self._photos = photos
         self._lens = lens
         self._target = target

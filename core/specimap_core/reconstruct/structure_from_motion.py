@@ -19,6 +19,7 @@ from specimap_core.fiducials.observations import Observations
 from specimap_core.fiducials.triangulation import triangulate
 from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
 from specimap_core.geometry.colmap_cameras import colmap_from_opencv, opencv_from_colmap
+from specimap_core.native import quiet_colmap
 from specimap_core.photos.reading import Photo
 from specimap_core.reconstruct.features.base import FeatureKind, Features
 from specimap_core.reconstruct.features.sift import match
@@ -72,6 +73,7 @@ def structure_from_motion(
 
     ``focal_px``: from EXIF. ``tick`` is called between steps; what it raises ends the work.
     """
+    quiet_colmap()
     features = []
     for one in kind.extract(photos):
         features.append(one)

@@ -63,6 +63,7 @@ def write_pdf(document: Document, target: Path, progress: Callable[[float], None
 
 def _register_fonts() -> None:
     """DejaVu, which comes with matplotlib, has the signs and the letters that PDF's own fonts lack."""
+    plotting.quiet_matplotlib()
     import matplotlib
     from reportlab.pdfbase import pdfmetrics
     from reportlab.pdfbase.ttfonts import TTFont

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.ticker import MaxNLocator
 
 from specimap_core.geometry.cameras import Floats
 from specimap_core.report import plotting as p
@@ -99,6 +98,8 @@ def draw_photos(photos: Sequence[PhotoCorners], tiles: Sequence[Bytes], first: i
 def draw_residuals(photos: Sequence[PhotoCorners], factor: float) -> Figure:
     """All photos' residuals in the image plane, their lengths, and their RMS photo by photo."""
     figure = p.figure(p.WIDTH_IN, 5.2)
+    from matplotlib.ticker import MaxNLocator
+
     axes = figure.subplot_mosaic("AB;CC", height_ratios=(1.9, 1))
     plane, lengths_ax, by_photo = axes["A"], axes["B"], axes["C"]
     wide, high = photos[0].width_px, photos[0].height_px

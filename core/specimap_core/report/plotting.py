@@ -49,9 +49,13 @@ NOTHING = "#f2f2f2"
 """Where there is no value."""
 
 _SALT = "specimap"
-# matplotlib's first import tells of its font list's first build and of a read-only home: no news to the user.
-logging.getLogger("matplotlib").setLevel(logging.ERROR)
 _svg_lock = threading.Lock()
+
+
+def quiet_matplotlib() -> None:
+    """Keep matplotlib's notes from the user: its first import tells of its font list's first build, or of a read-only
+    home. Called before that import."""
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
 
 
 def figure(width_in: float = WIDTH_IN, height_in: float = 3.2) -> Figure:
@@ -60,6 +64,7 @@ def figure(width_in: float = WIDTH_IN, height_in: float = 3.2) -> Figure:
     Raises:
         BackendUnavailableError: matplotlib is not installed.
     """
+    quiet_matplotlib()
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -110,6 +115,7 @@ def bare(ax: Axes, *, title: str = "") -> Axes:
 
 def colour_map(name: str) -> Colormap:
     """A perceptual colour map of matplotlib in which missing values (NaN) are light grey."""
+    quiet_matplotlib()
     import matplotlib
 
     return matplotlib.colormaps[name].with_extremes(bad=NOTHING)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Annotated, Protocol
@@ -26,7 +27,7 @@ UNFINISHED_UPLOADS = AppState[UnfinishedUploads]("unfinished_uploads")
 
 
 def _open(app: FastAPI, context: AppContext) -> None:
-    JUDGE.set(app, Judge(context.settings))
+    JUDGE.set(app, Judge(context.settings, os.environ))
 
 
 @asynccontextmanager

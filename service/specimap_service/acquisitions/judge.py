@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -38,8 +38,12 @@ Verdict = dict[str, Any]
 class Judge:
     """Up to two children, started when first needed and kept warm. Safe to share between threads."""
 
-    def __init__(self, settings: ServiceSettings, command: Sequence[str] = COMMAND) -> None:
+    def __init__(
+        self, settings: ServiceSettings, environment: Mapping[str, str], command: Sequence[str] = COMMAND
+    ) -> None:
+        """``environment``: the service's own, of which :data:`PASSED_ON` goes on to the children."""
         self._settings = settings
+        self._environment = {name: environment[name] for name in PASSED_ON if name in environment}
         self._command = (
             *command,
             str(settings.judge_memory_bytes),
@@ -131,7 +135,7 @@ class Judge:
         with self._lock:
             if self._closed:
                 raise _stopping()
-            child = _Child(self._command, self._settings.scratch)
+            child = _Child(self._command, self._environment, self._settings.scratch)
             self._children.add(child)
         try:
             child.receive(START_SECONDS)
@@ -180,8 +184,7 @@ class _GoneError(Exception):
 class _Child:
     """One process; one thread talks to it."""
 
-    def __init__(self, command: Sequence[str], scratch: Path) -> None:
-        environment = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
+    def __init__(self, command: Sequence[str], environment: Mapping[str, str], scratch: Path) -> None:
         threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
         self._process = subprocess.Popen(
             command,

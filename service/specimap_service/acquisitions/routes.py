@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import datetime
-from typing import Annotated
+from typing import Annotated, cast, get_args
 
 import sqlalchemy as sa
 from fastapi import APIRouter, Query
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, StringConstraints
 from sqlalchemy.orm import Session
 
+from specimap_core.pipeline.options import DEFAULTS, Dictionary
 from specimap_infra.completeness import missing
 from specimap_infra.database import utc_now
 from specimap_infra.errors import JobConflictError
@@ -18,7 +19,7 @@ from specimap_infra.job_schemas import EdgeMm
 from specimap_infra.tables import FINAL_STATES, Acquisition, Job, StoredFile, Upload
 from specimap_service.acquisitions.capacity import locked_acquisition, no_acquisition
 from specimap_service.acquisitions.dependencies import JudgeDep, UnfinishedUploadsDep
-from specimap_service.acquisitions.schemas import AcquisitionId, Dictionary, FileCounts, counts
+from specimap_service.acquisitions.schemas import AcquisitionId, FileCounts, counts
 from specimap_service.auth.dependencies import Admin, Reader, Uploader
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import Context, audit
@@ -28,6 +29,9 @@ from specimap_service.paging import After, Limit, Moment, Page, page_of
 router = APIRouter(prefix="/v1", tags=["acquisitions"])
 PSEUDONYM = r"^[A-Za-z0-9._-]{1,64}$"
 Pseudonym = Annotated[str, StringConstraints(pattern=PSEUDONYM)]
+
+# The contract has always listed the families in this order here.
+DICTIONARIES_IN_CONTRACT: list[JsonValue] = [*sorted(get_args(Dictionary), key=lambda name: "APRILTAG" in name)]
 
 
 class AcquisitionRequest(BaseModel):
@@ -39,8 +43,12 @@ class AcquisitionRequest(BaseModel):
 
     specimen_id: Pseudonym = Field(description="Pseudonym of the specimen: letters, digits, dot, dash, underscore.")
     accession_number: Pseudonym | None = Field(None, description="Pseudonymous too, for finding it again.")
-    dictionary: Dictionary = Field("DICT_4X4_50", description="ArUco dictionary of the marker cards.")
-    edge_mm: EdgeMm = 6.8
+    dictionary: Dictionary = Field(
+        cast(Dictionary, DEFAULTS.dictionary),
+        description="ArUco dictionary of the marker cards.",
+        json_schema_extra={"enum": DICTIONARIES_IN_CONTRACT},
+    )
+    edge_mm: EdgeMm = DEFAULTS.edge_mm
     notes: Annotated[str, StringConstraints(max_length=2000, pattern=r"^[^\x00]*$")] = Field(
         "", description="About the capture; no patient's data."
     )

@@ -16,31 +16,6 @@ Role = Literal["photo", "cube", "white", "dark"]
 VerdictName = Literal["accepted", "doubtful", "refused"]
 AcquisitionId = Annotated[str, Path(pattern=r"^acq_[0-9a-z]{26}$", examples=["acq_01k0000000000000000000000"])]
 FileId = Annotated[str, Path(pattern=r"^file_[0-9a-z]{26}$", examples=["file_01k0000000000000000000000"])]
-Dictionary = Literal[
-    "DICT_4X4_50",
-    "DICT_4X4_100",
-    "DICT_4X4_250",
-    "DICT_4X4_1000",
-    "DICT_5X5_50",
-    "DICT_5X5_100",
-    "DICT_5X5_250",
-    "DICT_5X5_1000",
-    "DICT_6X6_50",
-    "DICT_6X6_100",
-    "DICT_6X6_250",
-    "DICT_6X6_1000",
-    "DICT_7X7_50",
-    "DICT_7X7_100",
-    "DICT_7X7_250",
-    "DICT_7X7_1000",
-    "DICT_ARUCO_ORIGINAL",
-    "DICT_ARUCO_MIP_36h12",
-    "DICT_APRILTAG_16h5",
-    "DICT_APRILTAG_25h9",
-    "DICT_APRILTAG_36h10",
-    "DICT_APRILTAG_36h11",
-]
-"""Those of OpenCV, which the service does not load."""
 
 
 class Remark(BaseModel):

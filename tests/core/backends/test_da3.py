@@ -35,10 +35,12 @@ from specimap_core.reconstruct.backend import (
     corners_in_photos,
     detect_in_photos,
 )
+from specimap_core.reconstruct.backends import requirements
 from specimap_core.reconstruct.backends.da3.backend import CHILD, Da3Backend
 from specimap_core.reconstruct.backends.da3.child import VARIANTS, variant_of
 from specimap_core.reconstruct.backends.da3.prepare import conditioning
 from specimap_core.reconstruct.backends.da3.settings import Da3Settings, settings_from_environment
+from specimap_core.reconstruct.backends.environment import BackendSettings
 from specimap_core.reconstruct.backends.weights import sha256_of
 from specimap_core.sandbox.process import run_child
 from specimap_core.truth.judge import judge
@@ -110,10 +112,9 @@ def test_true_depth_in_any_unit_makes_a_true_cloud(
 ) -> None:
     script = oracle(tmp_path, SMALL, SIZE_PX, noise=0.01, lost=(3,))
     own = Da3Settings(weights=weights, size_px=SIZE_PX, batch=5)
-    monkeypatch.setattr(stages, "backend_named", lambda name: {"da3": Da3Backend(own, script)}[name])
-    # The run's key names the weights; what a real network would import is not needed.
-    monkeypatch.setenv("SPECIMAP_DA3_WEIGHTS", str(weights))
-    monkeypatch.setattr("specimap_core.reconstruct.backends.requirements.check_backend", lambda name: None)
+    monkeypatch.setattr(stages, "backend_named", lambda name, backends: {"da3": Da3Backend(own, script)}[name])
+    # What a real network would import is not needed.
+    monkeypatch.setattr(requirements, "check_backend", lambda name, backends: None)
     settings = PipelineSettings()
     settings = replace(settings, reconstruct=replace(settings.reconstruct, backend="da3"))
     heard: list[tuple[str, float]] = []
@@ -121,6 +122,7 @@ def test_true_depth_in_any_unit_makes_a_true_cloud(
         Inputs(small.photos, small.header),
         tmp_path / "out",
         settings,
+        backends=BackendSettings(da3=own),  # the run's key names the weights
         progress=lambda stage, share: heard.append((stage, share)),
     )
     found = judge(tmp_path / "out", small.folder)

@@ -17,14 +17,15 @@ from specimap_core.bundle_adjust.adjust import AdjustSettings
 from specimap_core.errors import BackendUnavailableError, SettingsError
 from specimap_core.pipeline.artefacts import key_of
 from specimap_core.pipeline.keys import surface_keys
+from specimap_core.pipeline.options import Adjustment, Backend, RunOptions
 from specimap_core.pipeline.settings import PipelineSettings, settings_from
 from specimap_core.reconstruct.backend import ReconstructSettings
-from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES
+from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES, backends_from
 from specimap_core.reconstruct.backends.mast3r import settings as mast3r
 from specimap_core.reconstruct.backends.requirements import check_required
 from specimap_core.reconstruct.dense import patchmatch
-from specimap_core.reconstruct.dense.depth_map import DepthSettings, Device
-from specimap_core.reconstruct.dense.device import DEVICES, dense_device
+from specimap_core.reconstruct.dense.depth_map import DepthSettings
+from specimap_core.reconstruct.dense.device import DEVICES, Device, dense_device
 from specimap_core.reconstruct.features import choice
 from specimap_core.sandbox.environment import bare_environment
 from specimap_core.sandbox.process import child_environment
@@ -36,7 +37,8 @@ from tests.support.scenes import OnDisk
 from tests.support.worker_scene import shop
 
 Bring = Callable[[Path, pytest.MonkeyPatch], Path]
-BACKENDS = [("mast3r", bring_mast3r), ("da3", bring_da3)]
+BACKENDS: list[tuple[Backend, Bring]] = [("mast3r", bring_mast3r), ("da3", bring_da3)]
+FORMS: tuple[Adjustment, ...] = ("rigid", "free")
 PHOTOS = {"a.jpg": "1" * 64}
 
 
@@ -46,18 +48,13 @@ def bare(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     return monkeypatch
 
 
-def run_with(backend: str = "colmap", adjustment: str = "rigid") -> PipelineSettings:
-    return settings_from(
-        edge_mm=6.8,
-        dictionary="DICT_4X4_50",
-        method="camera",
-        adjustment=adjustment,
-        r_pc=0.5,
-        r_reg=2.0,
-        backend=backend,
-        features="auto",
-        working_px=1280,
-    )
+def run_with(backend: Backend = "colmap", adjustment: Adjustment = "rigid") -> PipelineSettings:
+    options = RunOptions(backend=backend, adjustment=adjustment)
+    return settings_from(options, dense_device(os.environ))
+
+
+def keys_of(settings: PipelineSettings) -> dict[str, str]:
+    return surface_keys(PHOTOS, settings, backends_from(os.environ, settings.reconstruct.backend))
 
 
 # ---- who sees them ------------------------------------------------------------------------------------
@@ -124,7 +121,7 @@ def test_the_device_comes_from_the_environment(bare: pytest.MonkeyPatch) -> None
     assert run_with().reconstruct.depth.device == "auto"
     for device in DEVICES:
         bare.setenv("SPECIMAP_DENSE_DEVICE", f" {device} ")
-        assert run_with().reconstruct.depth.device == device == dense_device()
+        assert run_with().reconstruct.depth.device == device == backends_from(os.environ).device
     bare.setenv("SPECIMAP_DENSE_DEVICE", "cuda")
     with pytest.raises(SettingsError, match="SPECIMAP_DENSE_DEVICE is 'cuda'") as caught:
         run_with()
@@ -143,42 +140,42 @@ def test_a_device_that_there_is_not_is_refused() -> None:
 
 def test_the_default_backends_keys_know_nothing_of_other_backends(tmp_path: Path, bare: pytest.MonkeyPatch) -> None:
     settings = run_with()
-    keys = surface_keys(PHOTOS, settings)
+    keys = keys_of(settings)
     chosen = settings.as_dict()
     parts = {"photos": PHOTOS, "acquisition": chosen["acquisition"], "s": chosen["reconstruct"]}
     assert keys["reconstruct"] == key_of("reconstruct", parts)
     bring_mast3r(tmp_path, bare)
     bring_da3(tmp_path, bare)
-    assert surface_keys(PHOTOS, run_with()) == keys
+    assert keys_of(run_with()) == keys
     bare.setenv("SPECIMAP_DENSE_DEVICE", "auto")
-    assert surface_keys(PHOTOS, run_with()) == keys
+    assert keys_of(run_with()) == keys
     bare.setenv("SPECIMAP_DENSE_DEVICE", "cpu")
-    assert not set(surface_keys(PHOTOS, run_with()).values()) & set(keys.values())
+    assert not set(keys_of(run_with()).values()) & set(keys.values())
 
 
 @pytest.mark.parametrize("backend", ["colmap", *(name for name, _ in BACKENDS)])
 def test_the_adjustment_is_an_input_of_stage_1_where_that_finds_cameras_without_the_markers(
-    backend: str, tmp_path: Path, bare: pytest.MonkeyPatch
+    backend: Backend, tmp_path: Path, bare: pytest.MonkeyPatch
 ) -> None:
     bring_mast3r(tmp_path, bare)
     bring_da3(tmp_path, bare)
-    rigid, free = (surface_keys(PHOTOS, run_with(backend, form)) for form in ("rigid", "free"))
+    rigid, free = (keys_of(run_with(backend, form)) for form in FORMS)
     assert rigid["adjust"] != free["adjust"]
     assert (rigid["reconstruct"] == free["reconstruct"]) == (backend != "mast3r")
     assert run_with(backend, "free").for_stage1().hold_to_markers == (backend != "mast3r")
     # An edge that stage 2 alone was told counts as well.
     wide = replace(run_with(backend), adjust=AdjustSettings(edge_mm=7.0))
-    assert surface_keys(PHOTOS, wide)["reconstruct"] != rigid["reconstruct"]
+    assert keys_of(wide)["reconstruct"] != rigid["reconstruct"]
 
 
 @pytest.mark.parametrize(("backend", "bring"), BACKENDS)
 def test_settings_and_weights_of_a_network_are_inputs_of_stage_1(
-    backend: str, bring: Bring, tmp_path: Path, bare: pytest.MonkeyPatch
+    backend: Backend, bring: Bring, tmp_path: Path, bare: pytest.MonkeyPatch
 ) -> None:
     weights, prefix = bring(tmp_path, bare), f"SPECIMAP_{backend.upper()}_"
 
     def keys() -> dict[str, str]:
-        return surface_keys(PHOTOS, run_with(backend))
+        return keys_of(run_with(backend))
 
     first = keys()
     assert first == keys()
@@ -205,7 +202,7 @@ def job(tmp_path: Path, small: OnDisk) -> Iterator[Callable[[], dict[str, str]]]
     """The keys of a job with MASt3R, as a worker would plan them."""
     with shop(tmp_path / "shop") as yard:
         job_id = yard.submit(yard.acquisition(small.photos, small.header), backend="mast3r")
-        yield lambda: plan_of(yard.database, job_id).keys
+        yield lambda: plan_of(yard.database, job_id, backends_from(os.environ)).keys
 
 
 def test_a_worker_refuses_a_job_whose_backend_it_lacks(
@@ -222,16 +219,20 @@ def test_a_worker_refuses_a_job_whose_backend_it_lacks(
 # ---- what is asked for and not there ------------------------------------------------------------------
 
 
+def require(settings: ReconstructSettings) -> None:
+    check_required(settings, backends_from(os.environ, settings.backend))
+
+
 def refused(**given: object) -> BackendUnavailableError:
     with pytest.raises(BackendUnavailableError) as caught:
-        check_required(replace(ReconstructSettings(), **given))  # type: ignore[arg-type]
+        require(replace(ReconstructSettings(), **given))  # type: ignore[arg-type]
     assert caught.value.advice
     return caught.value
 
 
 def test_the_default_needs_nothing_more(bare: pytest.MonkeyPatch) -> None:
     bare.setattr("specimap_core.reconstruct.backends.requirements.probe", None)  # no interpreter is asked
-    check_required(ReconstructSettings())
+    require(ReconstructSettings())
 
 
 def test_features_that_are_not_installed_are_refused_where_the_backend_takes_them(bare: pytest.MonkeyPatch) -> None:
@@ -245,9 +246,9 @@ def test_a_gpu_that_cannot_be_used_is_refused_where_it_is_asked_for(bare: pytest
     on_gpu = DepthSettings(device="gpu")
     bare.setattr(patchmatch, "what_is_missing", lambda: "No CUDA device is in sight.")
     assert refused(depth=on_gpu).message.endswith("on a GPU. No CUDA device is in sight.")
-    check_required(ReconstructSettings())
+    require(ReconstructSettings())
     bare.setattr(patchmatch, "what_is_missing", lambda: None)
-    check_required(ReconstructSettings(depth=on_gpu))
+    require(ReconstructSettings(depth=on_gpu))
 
 
 def test_a_network_is_refused_for_what_it_lacks_first(tmp_path: Path, bare: pytest.MonkeyPatch) -> None:
@@ -263,4 +264,4 @@ def test_a_network_is_refused_for_what_it_lacks_first(tmp_path: Path, bare: pyte
     assert "ENV/bin/pip install no_such_module" in error.advice
     assert error.advice.endswith("export SPECIMAP_MAST3R_PYTHON=ENV/bin/python")
     bare.setattr(mast3r, "MODULES", ("numpy",))
-    check_required(ReconstructSettings(backend="mast3r"))
+    require(ReconstructSettings(backend="mast3r"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import asdict
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from specimap_core.pipeline.outputs import Inputs
 from specimap_core.pipeline.run import run_pipeline
 from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.reconstruct.backend import ReconstructSettings
+from specimap_core.reconstruct.backends.environment import backends_from
 from specimap_core.reconstruct.backends.mast3r import backend
 from specimap_core.reconstruct.backends.mast3r.settings import PREFIX, Mast3rSettings
 from specimap_core.truth.judge import judge
@@ -120,9 +122,10 @@ def test_a_run_with_free_corners_goes_the_published_way(
     monkeypatch.setenv(PREFIX + "SIZE_PX", "192")
     monkeypatch.setattr(backend, "CHILD", SCRIPT)
     # The script needs none of what a real network would import.
-    monkeypatch.setattr("specimap_core.reconstruct.backends.requirements.check_backend", lambda name: None)
+    monkeypatch.setattr("specimap_core.reconstruct.backends.requirements.check_backend", lambda name, backends: None)
     settings = PipelineSettings(reconstruct=ReconstructSettings(backend="mast3r"), adjust=AdjustSettings("free"))
-    report = run_pipeline(Inputs(small.photos, small.header), tmp_path / "out", settings, workers=2)
+    backends = backends_from(os.environ, "mast3r")
+    report = run_pipeline(Inputs(small.photos, small.header), tmp_path / "out", settings, backends=backends, workers=2)
     assert (report.backend, report.adjustment) == ("mast3r", "free")
     assert settings.for_stage1().hold_to_markers is False
     assert report.settings["reconstruct"] == asdict(settings.for_stage1())

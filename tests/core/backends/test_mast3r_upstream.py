@@ -5,6 +5,7 @@ The published weights are not needed: an oracle stands in the network's place an
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from specimap_core.pipeline.outputs import Inputs
 from specimap_core.pipeline.run import run_pipeline
 from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.reconstruct.backend import ReconstructSettings
+from specimap_core.reconstruct.backends.environment import backends_from
 from specimap_core.reconstruct.backends.mast3r import backend
 from specimap_core.reconstruct.backends.mast3r.images import plan_preparation
 from specimap_core.reconstruct.backends.mast3r.settings import PREFIX
@@ -140,7 +142,7 @@ def with_oracle(folder: Path, monkeypatch: pytest.MonkeyPatch, bare: int) -> tup
         monkeypatch.setenv(name, value)
     monkeypatch.setattr(backend, "CHILD", SUPPORT / "mast3r_oracle.py")
     # The oracle brings its own stand-in for torchvision.
-    monkeypatch.setattr("specimap_core.reconstruct.backends.requirements.check_backend", lambda name: None)
+    monkeypatch.setattr("specimap_core.reconstruct.backends.requirements.check_backend", lambda name, backends: None)
     return disk, seen
 
 
@@ -150,7 +152,8 @@ def test_the_whole_way_with_exact_predictions(tmp_path: Path, monkeypatch: pytes
     disk, seen = with_oracle(tmp_path, monkeypatch, bare)
     out = tmp_path / "out"
     settings = PipelineSettings(reconstruct=ReconstructSettings(backend="mast3r"))
-    report = run_pipeline(Inputs(disk.photos, disk.header), out, settings, workers=1)
+    backends = backends_from(os.environ, "mast3r")
+    report = run_pipeline(Inputs(disk.photos, disk.header), out, settings, backends=backends, workers=1)
     assert report.photos.used == [p.name for p in seen.photos]
     assert {"licence_non_commercial", "backend_run"} <= {w.code for w in report.warnings}
     assert list((tmp_path / "cache").iterdir()) == []
@@ -168,7 +171,7 @@ def test_the_whole_way_with_exact_predictions(tmp_path: Path, monkeypatch: pytes
 def test_the_published_way_with_exact_predictions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bare: int) -> None:
     """Judged before the cube: free corners of eight photos leave the cube's camera loose, with any backend."""
     disk, seen = with_oracle(tmp_path, monkeypatch, bare)
-    found = backend.Mast3rBackend().reconstruct(
+    found = backend.Mast3rBackend(backends_from(os.environ, "mast3r").mast3r).reconstruct(
         seen.photos, seen.corners, ReconstructSettings(hold_to_markers=False), workers=1, progress=lambda share: None
     )
     assert found.photos == tuple(range(8))

@@ -11,7 +11,7 @@ import pytest
 
 from specimap_core.errors import BackendUnavailableError
 from specimap_core.reconstruct.backends import weights
-from specimap_core.reconstruct.backends.weights import Weights, find_weights, named_path, sha256_of
+from specimap_core.reconstruct.backends.weights import Weights, find_weights, hash_cache_in, named_path, sha256_of
 
 
 def find(path: Path | None, pin: str | None = None) -> Weights:
@@ -60,15 +60,16 @@ def test_a_variable_names_a_path() -> None:
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """The cache folder, with files of any size kept in it; this program's own memory is cleared."""
     monkeypatch.setattr(weights, "KEPT_FROM_BYTES", 0)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     weights._sha256.cache_clear()
-    yield tmp_path / "cache" / "specimap" / "weights"
+    folder = hash_cache_in({"XDG_CACHE_HOME": str(tmp_path / "cache")})
+    assert folder is not None
+    yield folder
     weights._sha256.cache_clear()
 
 
-def read_anew(path: Path) -> str:
+def read_anew(path: Path, cache: Path) -> str:
     weights._sha256.cache_clear()
-    return sha256_of(path)
+    return sha256_of(path, cache)
 
 
 def test_a_sha256_is_kept_for_the_next_program_until_the_file_changes(tmp_path: Path, cache: Path) -> None:
@@ -76,14 +77,14 @@ def test_a_sha256_is_kept_for_the_next_program_until_the_file_changes(tmp_path: 
     file.write_bytes(b"weights")
     os.utime(file, ns=(0, 10**18))
     digest = hashlib.sha256(b"weights").hexdigest()
-    assert read_anew(file) == digest
+    assert read_anew(file, cache) == digest
     (note,) = cache.iterdir()
     assert note.read_text("ascii") == digest
     note.write_text("1" * 64, "ascii")
-    assert read_anew(file) == "1" * 64, "it is not read again"
+    assert read_anew(file, cache) == "1" * 64, "it is not read again"
     file.write_bytes(b"changed")
     os.utime(file, ns=(0, 10**18 + 1))
-    assert read_anew(file) == hashlib.sha256(b"changed").hexdigest()
+    assert read_anew(file, cache) == hashlib.sha256(b"changed").hexdigest()
     assert len(list(cache.iterdir())) == 2
 
 
@@ -91,19 +92,22 @@ def test_a_sha256_is_kept_for_the_next_program_until_the_file_changes(tmp_path: 
 def test_a_kept_sha256_that_is_none_is_not_believed(tmp_path: Path, cache: Path, kept: str) -> None:
     file = tmp_path / "weights.pth"
     file.write_bytes(b"weights")
-    digest = read_anew(file)
+    digest = read_anew(file, cache)
     (note,) = cache.iterdir()
     note.write_text(kept, "ascii")
-    assert read_anew(file) == digest == note.read_text("ascii")
+    assert read_anew(file, cache) == digest == note.read_text("ascii")
 
 
-def test_a_cache_that_cannot_be_written_is_done_without(
-    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_cache_is_in_the_users_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert hash_cache_in({"XDG_CACHE_HOME": "/a"}) == Path("/a/specimap/weights")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert hash_cache_in({}) == tmp_path / ".cache" / "specimap" / "weights"
+
+
+def test_a_cache_that_cannot_be_written_is_done_without(tmp_path: Path, cache: Path) -> None:
     file = tmp_path / "weights.pth"
     file.write_bytes(b"weights")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(file))  # no folder
-    assert read_anew(file) == hashlib.sha256(b"weights").hexdigest()
+    assert read_anew(file, file / "weights") == hashlib.sha256(b"weights").hexdigest()
     assert not cache.exists()
 
 
@@ -111,5 +115,5 @@ def test_small_files_are_not_kept(tmp_path: Path, cache: Path, monkeypatch: pyte
     monkeypatch.setattr(weights, "KEPT_FROM_BYTES", 8)
     file = tmp_path / "weights.pth"
     file.write_bytes(b"weights")
-    assert read_anew(file) == hashlib.sha256(b"weights").hexdigest()
+    assert read_anew(file, cache) == hashlib.sha256(b"weights").hexdigest()
     assert not cache.exists()

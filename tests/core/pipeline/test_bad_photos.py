@@ -17,6 +17,7 @@ from specimap_core.cloud import Cloud
 from specimap_core.json_text import json_text
 from specimap_core.photos.folder import photo_folder, photo_paths
 from specimap_core.photos.reading import AcquisitionSettings, read_photos
+from specimap_core.pipeline.options import OPTIONS
 from specimap_core.pipeline.outputs import Inputs
 from specimap_core.pipeline.run import run_pipeline
 from specimap_core.pipeline.settings import PipelineSettings
@@ -294,9 +295,7 @@ def test_an_edge_in_another_unit_is_refused(
     small: OnDisk, tmp_path: Path, edge: float, named: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The unit's own range is not what is asked for here.
-    from specimap_core.pipeline import limits
-
-    monkeypatch.setitem(limits.RANGES, "edge_mm", (0.01, 1000.0))
+    monkeypatch.setitem(OPTIONS, "edge_mm", replace(OPTIONS["edge_mm"], bounds=(0.01, 1000.0)))
     refusal = run_refused(small.photos, small.header, tmp_path / "out", "--edge-mm", edge)
     assert refusal["code"] == "edge_implausible"
     assert named in str(refusal["advice"])

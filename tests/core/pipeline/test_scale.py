@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import get_args
 
-import numpy as np
 import pytest
 
 from specimap_core.errors import EdgeImplausibleError, SettingsError
 from specimap_core.geometry.cameras import Floats, Pose
-from specimap_core.pipeline.limits import RANGES, advice_on
 from specimap_core.pipeline.scale_check import check_scale, reach_mm
 from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.render.orthographic import RenderSettings
-from specimap_infra.job_schemas import EdgeMm, JobSettings
-from specimap_service.acquisitions.routes import AcquisitionRequest
 from tests.support.scenes import marker_scene
 
 
@@ -75,28 +70,3 @@ def test_grids_too_fine_or_too_coarse_for_the_layout(name: str, cell: float) -> 
 def test_a_single_marker_is_not_held_to_the_grids() -> None:
     poses, corners = scene(1.0)
     check_scale(poses, corners[:1], with_edge(6.8))
-
-
-def test_advice_on_an_edge_out_of_range_names_the_units() -> None:
-    assert "30 if it is in metres" in advice_on("edge_mm", 0.03)
-    assert "6.8 if it is in metres" in advice_on("edge_mm", 0.0068)
-    assert "6.807 if it is in inches" in advice_on("edge_mm", 0.268)
-    assert "if it is" not in advice_on("edge_mm", 300)
-    assert advice_on("r_pc", 1e-5) == "Give a number from 0.05 to 20."
-
-
-def test_the_service_has_the_same_ranges() -> None:
-    for name in ("r_pc", "r_reg", "working_px"):
-        bounds = {type(m).__name__: m for m in JobSettings.model_fields[name].metadata}
-        assert (bounds["Ge"].ge, bounds["Le"].le) == RANGES[name]
-    field = get_args(EdgeMm)[1]
-    assert {getattr(m, "ge", None) or getattr(m, "le", None) for m in field.metadata} >= set(RANGES["edge_mm"])
-    for edge in (0.03, 300, float("nan")):
-        with pytest.raises(ValueError, match="edge_mm"):
-            AcquisitionRequest.model_validate({"specimen_id": "S-1", "edge_mm": edge})
-        with pytest.raises(SettingsError):
-            with_edge(edge).check()
-    for edge in RANGES["edge_mm"]:
-        assert AcquisitionRequest.model_validate({"specimen_id": "S-1", "edge_mm": edge}).edge_mm == edge
-        with_edge(edge).check()
-    assert np.isfinite(list(RANGES.values())).all()

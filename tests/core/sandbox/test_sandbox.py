@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from specimap_core.errors import SettingsError
-from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES
+from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES, backends_from
 from specimap_core.sandbox import Mode, Protection, Reach, confined, program_rules, protection
 from specimap_core.sandbox.launch import NOT_CONFINED
 from specimap_core.sandbox.places import interpreter_places
@@ -35,7 +35,7 @@ TEXT = Path(escapes.__file__).read_text("utf-8")
 
 JUDGING = f"""{TEXT}
 import json
-from specimap_core.screening import __main__ as child
+from specimap_core.screening import process as child
 from specimap_core.screening.verdict import Verdict
 
 def escape(task):
@@ -123,7 +123,7 @@ def untouched(told: dict[str, Any]) -> None:
 
 def in_judging(told: dict[str, Any], folder: Path, mode: Mode) -> dict[str, str]:
     settings = load_settings(data_dir=folder.parent / "data", sandbox=mode)
-    judge = Judge(settings, (sys.executable, "-c", JUDGING))
+    judge = Judge(settings, os.environ, (sys.executable, "-c", JUDGING))
     task = folder / "task"
     task.mkdir(parents=True)
     (task / "cube").write_text(json.dumps({**told, "link": str(linked(task, told))}))
@@ -243,7 +243,7 @@ def test_stages_reach_what_the_environment_names_for_backends(tmp_path: Path, mo
     monkeypatch.setenv("SPECIMAP_DA3_WEIGHTS", str(weights))
     monkeypatch.setenv("SPECIMAP_MAST3R_HOME", str(home))
     monkeypatch.setenv("SPECIMAP_MAST3R_CACHE", str(cache))
-    cells = Cells(tmp_path / "work", "test", "require", ())
+    cells = Cells(tmp_path / "work", "test", "require", (), backends_from(os.environ))
     cell = cells.new()
     program = (
         "import sys; print(open(sys.argv[1]).read(), open(sys.argv[2]).read());"

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from specimap_core.errors import SpecimapError
 from specimap_core.reconstruct.backends.da3 import settings as da3
+from specimap_core.reconstruct.backends.environment import backends_from
 from specimap_core.reconstruct.backends.mast3r import settings as mast3r
 from specimap_core.reconstruct.backends.probe import cpu_count, driver_gpus, probe
 from specimap_core.reconstruct.backends.weights import Weights
@@ -103,9 +104,9 @@ class _Asked:
         self._pool.shutdown()
 
 
-def diagnose() -> Diagnosis:
-    """Look at everything; takes as long as importing the slowest library."""
-    own, plans = sys.executable, [_mast3r(), _da3()]
+def diagnose(environment: Mapping[str, str]) -> Diagnosis:
+    """Look at everything that the environment names; takes as long as importing the slowest library."""
+    own, plans = sys.executable, [_mast3r(environment), _da3(environment)]
     asked = _Asked([(own, ALIKED_MODULES), *((p.python, p.modules) for p in plans)])
     # The default backend's libraries are asked for apart, beside those that take longer.
     colmap = _Asked([(own, COLMAP_MODULES)])
@@ -185,9 +186,9 @@ def _weights_facts(weights: Weights) -> dict[str, Any]:
     return {"path": str(weights.path), "bytes": weights.size, "sha256": weights.sha256, "pinned": weights.pinned}
 
 
-def _mast3r() -> _Plan:
+def _mast3r(environment: Mapping[str, str]) -> _Plan:
     try:
-        chosen = mast3r.settings_from_environment()
+        chosen = backends_from(environment, mast3r.NAME).mast3r
     except SpecimapError as error:
         return _Plan(mast3r.NAME, mast3r.PREFIX, sys.executable, (), (), error)
     steps = (
@@ -197,9 +198,9 @@ def _mast3r() -> _Plan:
     return _Plan(mast3r.NAME, mast3r.PREFIX, chosen.python or sys.executable, chosen.modules, steps)
 
 
-def _da3() -> _Plan:
+def _da3(environment: Mapping[str, str]) -> _Plan:
     try:
-        chosen = da3.settings_from_environment()
+        chosen = backends_from(environment, da3.NAME).da3
     except SpecimapError as error:
         return _Plan(da3.NAME, da3.PREFIX, sys.executable, (), (), error)
     steps = (

@@ -1,18 +1,19 @@
 """What the environment says of backends and of the device for dense stereo: all its variables, in one place.
 
-The service's settings and the process of a stage read it, so nothing heavy is imported here.
+A program reads it once, when it starts, and passes the answer on. Nothing heavy is imported, so that the service can.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field, replace
 
 from specimap_core.reconstruct.backends.da3 import settings as da3
+from specimap_core.reconstruct.backends.da3.settings import Da3Settings
 from specimap_core.reconstruct.backends.mast3r import settings as mast3r
-from specimap_core.reconstruct.backends.weights import Weights
-from specimap_core.reconstruct.dense.device import DENSE_DEVICE, dense_device
+from specimap_core.reconstruct.backends.mast3r.settings import Mast3rSettings
+from specimap_core.reconstruct.backends.weights import Weights, hash_cache_in
+from specimap_core.reconstruct.dense.device import DENSE_DEVICE, Device, dense_device
 
 BACKEND_VARIABLES: dict[str, str] = {
     **{mast3r.PREFIX + name: meaning for name, meaning in mast3r.VARIABLES.items()},
@@ -20,47 +21,63 @@ BACKEND_VARIABLES: dict[str, str] = {
     DENSE_DEVICE: "Where the default backend measures depth: auto, cpu or gpu; auto takes a GPU where there is one.",
 }
 """Variable, and what it is."""
-NOT_IN_IDENTITY = ("cache", "weights")
-"""Fields that leave the result as it is: where scratch files lie, and the path of weights whose sha256 counts."""
+NOT_IN_IDENTITY = ("cache", "hash_cache", "weights")
+"""Fields that leave the result as it is: folders for scratch files and hashes, and the path of weights whose sha256
+counts."""
 
 
-def check_environment(environment: Mapping[str, str] = os.environ) -> None:
-    """Refuse values that cannot be, whichever backend a run will take. Looks at no file.
+@dataclass(frozen=True)
+class BackendSettings:
+    """Settings of the backends with a network, and the ``device`` of the default backend."""
+
+    mast3r: Mast3rSettings = field(default_factory=Mast3rSettings)
+    da3: Da3Settings = field(default_factory=Da3Settings)
+    device: Device = "auto"
+
+
+UNCONFIGURED = BackendSettings()
+"""With no network's code or weights named."""
+
+
+def backends_from(environment: Mapping[str, str], chosen: str | None = None) -> BackendSettings:
+    """The settings as the variables say; looks at no file.
+
+    ``chosen``: the backend that a run takes. Variables of other backends are not read then, so that a wrong one does
+    not stop the run; by default all are.
 
     Raises:
-        SettingsError: details name the variable.
+        SettingsError: a value cannot be; details name the variable.
     """
-    mast3r.settings_from_environment(environment)
-    da3.settings_from_environment(environment)
-    dense_device(environment)
+    found, hash_cache = BackendSettings(device=dense_device(environment)), hash_cache_in(environment)
+    if chosen in (None, mast3r.NAME):
+        network = mast3r.settings_from_environment(environment)
+        found = replace(found, mast3r=replace(network, hash_cache=hash_cache))
+    if chosen in (None, da3.NAME):
+        found = replace(found, da3=replace(da3.settings_from_environment(environment), hash_cache=hash_cache))
+    return found
 
 
-def backend_found(
-    name: str, environment: Mapping[str, str] = os.environ
-) -> tuple[mast3r.Mast3rSettings | da3.Da3Settings, Weights] | None:
+def backend_found(name: str, backends: BackendSettings) -> tuple[Mast3rSettings | Da3Settings, Weights] | None:
     """Settings and weights of a backend with a network; None for others.
 
     Raises:
-        SettingsError: a variable's value cannot be.
         BackendUnavailableError: its code or its weights are not there, or not the pinned ones.
     """
     if name == mast3r.NAME:
-        chosen = mast3r.settings_from_environment(environment)
-        mast3r.check_home(chosen.home)
-        return chosen, mast3r.weights_of(chosen)
+        mast3r.check_home(backends.mast3r.home)
+        return backends.mast3r, mast3r.weights_of(backends.mast3r)
     if name == da3.NAME:
-        own = da3.settings_from_environment(environment)
-        own.code_path()
-        return own, own.find_weights()
+        backends.da3.code_path()
+        return backends.da3, backends.da3.find_weights()
     return None
 
 
-def backend_identity(name: str, environment: Mapping[str, str] = os.environ) -> dict[str, object] | None:
-    """What a result of the backend depends on beside a run's own settings: its variables, and the weights' sha256.
+def backend_identity(name: str, backends: BackendSettings) -> dict[str, object] | None:
+    """What a result of the backend depends on apart from a run's own settings: its variables, and the weights' sha256.
 
     None for a backend that has neither. Raises as :func:`backend_found` does.
     """
-    found = backend_found(name, environment)
+    found = backend_found(name, backends)
     if found is None:
         return None
     chosen, weights = found

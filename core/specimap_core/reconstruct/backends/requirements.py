@@ -7,19 +7,18 @@ import sys
 from specimap_core.errors import BackendUnavailableError
 from specimap_core.reconstruct.backend import ReconstructSettings
 from specimap_core.reconstruct.backends.doctor import DEFAULT_BACKEND, install_command
-from specimap_core.reconstruct.backends.environment import backend_found
+from specimap_core.reconstruct.backends.environment import BackendSettings, backend_found
 from specimap_core.reconstruct.backends.mast3r.settings import NAME as MAST3R
 from specimap_core.reconstruct.backends.probe import probe
 
 
-def check_required(settings: ReconstructSettings) -> None:
+def check_required(settings: ReconstructSettings, backends: BackendSettings) -> None:
     """Refuse a backend, features or a device that are not to be had here.
 
     Costs nothing for the default backend; for others an interpreter is asked to import what they need: seconds.
 
     Raises:
         BackendUnavailableError: something is missing; message and advice name it.
-        SettingsError: a variable of the backend has a value that cannot be.
     """
     # Both load COLMAP, which stage 1 loads anyway.
     from specimap_core.reconstruct.dense.patchmatch import check_device
@@ -27,18 +26,18 @@ def check_required(settings: ReconstructSettings) -> None:
 
     if settings.backend != MAST3R:  # it has no use for features
         check_features(settings.features)
-    check_backend(settings.backend)
+    check_backend(settings.backend, backends)
     if settings.backend == DEFAULT_BACKEND:
         check_device(settings.depth)
 
 
-def check_backend(name: str) -> None:
+def check_backend(name: str, backends: BackendSettings) -> None:
     """Refuse a backend with a network whose code, weights or modules are not there; others pass.
 
     Raises:
-        BackendUnavailableError, SettingsError: see :func:`check_required`.
+        BackendUnavailableError: see :func:`check_required`.
     """
-    found = backend_found(name)
+    found = backend_found(name, backends)
     if found is None:
         return
     chosen, _ = found

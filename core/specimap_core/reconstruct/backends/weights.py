@@ -27,10 +27,18 @@ class Weights:
     pinned: bool
 
 
-def find_weights(name: str, variable: str, path: Path | None, *, pin: str | None = None, source: str = "") -> Weights:
+def find_weights(
+    name: str,
+    variable: str,
+    path: Path | None,
+    *,
+    pin: str | None = None,
+    source: str = "",
+    hash_cache: Path | None = None,
+) -> Weights:
     """The weights of backend ``name``, which ``variable`` names; ``source`` says in the advice where they come from.
 
-    ``pin``: the sha256 that the file must have, as 64 hexadecimal digits.
+    ``pin``: the sha256 that the file must have, as 64 hexadecimal digits. ``hash_cache``: see :func:`sha256_of`.
 
     Raises:
         BackendUnavailableError: none is named, the file is not there, or it is another than the pinned one.
@@ -49,7 +57,7 @@ def find_weights(name: str, variable: str, path: Path | None, *, pin: str | None
         )
     wanted = pin_of(pin, variable)
     try:
-        found = sha256_of(path)
+        found = sha256_of(path, hash_cache)
     except OSError as error:
         raise BackendUnavailableError(
             f"The weights file {path} does not read: {error.strerror}.", advice=f"Correct {variable} or its rights."
@@ -80,18 +88,18 @@ def pin_of(text: str | None, variable: str) -> str | None:
     return pin or None
 
 
-def sha256_of(path: Path) -> str:
+def sha256_of(path: Path, hash_cache: Path | None = None) -> str:
     """The file's sha256, computed once for a file whose path, size and time of change stay the same.
 
-    That of a large file is kept in the user's cache folder, where that can be written.
+    That of a large file is kept in the folder ``hash_cache``, where there is one that can be written.
     """
     status = os.stat(path)
-    return _sha256(str(path.resolve()), status.st_size, status.st_mtime_ns)
+    return _sha256(str(path.resolve()), status.st_size, status.st_mtime_ns, hash_cache)
 
 
 @functools.lru_cache(maxsize=16)
-def _sha256(path: str, size: int, mtime_ns: int) -> str:
-    note = _note(path, size, mtime_ns) if size >= KEPT_FROM_BYTES else None
+def _sha256(path: str, size: int, mtime_ns: int, hash_cache: Path | None) -> str:
+    note = hash_cache / _note_name(path, size, mtime_ns) if hash_cache and size >= KEPT_FROM_BYTES else None
     if note is not None:
         with suppress(OSError, ValueError):
             kept = note.read_text("ascii")
@@ -105,21 +113,25 @@ def _sha256(path: str, size: int, mtime_ns: int) -> str:
     return digest
 
 
-def _note(path: str, size: int, mtime_ns: int) -> Path | None:
-    """Where the sha256 of that file is kept; None without a home."""
+def _note_name(path: str, size: int, mtime_ns: int) -> str:
+    """Name of the file that keeps the sha256 of that file."""
+    return hashlib.sha256(f"{path}\n{size}\n{mtime_ns}".encode(errors="surrogateescape")).hexdigest()[:32]
+
+
+def hash_cache_in(environment: Mapping[str, str]) -> Path | None:
+    """The folder in the user's cache folder for the sha256 of large files; None without a home."""
     try:
-        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        folder = Path(environment.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     except RuntimeError:
         return None
-    told = hashlib.sha256(f"{path}\n{size}\n{mtime_ns}".encode(errors="surrogateescape")).hexdigest()
-    return folder / "specimap" / "weights" / told[:32]
+    return folder / "specimap" / "weights"
 
 
 def _is_sha256(text: str) -> bool:
     return len(text) == 64 and set(text) <= set("0123456789abcdef")
 
 
-def named_path(variable: str, environment: Mapping[str, str] = os.environ) -> Path | None:
+def named_path(variable: str, environment: Mapping[str, str]) -> Path | None:
     """The path that a variable names, None where it is empty or unset."""
     value = environment.get(variable, "").strip()
     return Path(value).expanduser().resolve() if value else None

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, View
+from specimap_core.reconstruct.dense.device import Device
 from specimap_core.reconstruct.dense.volume import Singles
 
 Bytes = NDArray[np.uint8]
-
-
-Device = Literal["auto", "cpu", "gpu"]
 
 
 @dataclass(frozen=True)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
+from typing import Literal, cast, get_args
 
 from specimap_core.errors import SettingsError
 
 DENSE_DEVICE = "SPECIMAP_DENSE_DEVICE"
+Device = Literal["auto", "cpu", "gpu"]
+DEVICES: tuple[str, ...] = get_args(Device)
 
 
-DEVICES = ("auto", "cpu", "gpu")
-
-
-def dense_device(environment: Mapping[str, str] = os.environ) -> str:
-    """One of :data:`DEVICES`.
+def dense_device(environment: Mapping[str, str]) -> Device:
+    """The device that the environment names.
 
     Raises:
         SettingsError: the variable says something else.
@@ -24,4 +23,4 @@ def dense_device(environment: Mapping[str, str] = os.environ) -> str:
         raise SettingsError(
             f"{DENSE_DEVICE} is {device!r}.", advice=f"It takes one of: {', '.join(DEVICES)}.", setting=DENSE_DEVICE
         )
-    return device
+    return cast(Device, device)

@@ -14,15 +14,13 @@ import numpy as np
 import pycolmap
 
 from specimap_core.geometry.colmap_cameras import opencv_from_colmap
+from specimap_core.native import quiet_colmap
 from specimap_core.photos.reading import Photo
 from specimap_core.reconstruct.features.base import Features, Pairs, in_pool
 
 RATIO = 0.8
 MOST_FEATURES = 2000
 
-
-# COLMAP reports every extractor it makes on standard error.
-pycolmap.logging.minloglevel = pycolmap.logging.WARNING
 # Importing COLMAP puts a handler of its own on SIGTERM, which prints a stack and ends the program; who runs this
 # program may want to stop in order.
 if threading.current_thread() is threading.main_thread():
@@ -31,6 +29,7 @@ if threading.current_thread() is threading.main_thread():
 
 def extract(photo: Photo) -> Features:
     """SIFT features of a photo; a low peak threshold, since tissue is weakly textured."""
+    quiet_colmap()
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
     options.num_threads = 1

@@ -21,7 +21,7 @@ from specimap_core.reconstruct.backend import (
 from specimap_core.reconstruct.backends.da3.known_depths import placed_features
 from specimap_core.reconstruct.backends.da3.prepare import conditioning, plan_preparation, windows
 from specimap_core.reconstruct.backends.da3.residual_field import bend
-from specimap_core.reconstruct.backends.da3.settings import NAME, PREFIX, Da3Settings, settings_from_environment
+from specimap_core.reconstruct.backends.da3.settings import NAME, PREFIX, Da3Settings
 from specimap_core.reconstruct.backends.depth_alignment import LARGEST_SCATTER, align, depths_at, on_markers
 from specimap_core.reconstruct.backends.warnings import left_out, ran
 from specimap_core.reconstruct.dense.cross_check import confirmed, nearest_photos, share_confirmed
@@ -46,8 +46,8 @@ class Da3Backend:
 
     name = NAME
 
-    def __init__(self, settings: Da3Settings | None = None, child: Path = CHILD) -> None:
-        """``settings``: by default what the environment says; ``child``: the script that holds the network."""
+    def __init__(self, settings: Da3Settings, child: Path = CHILD) -> None:
+        """``child``: the script that holds the network."""
         self._settings = settings
         self._child = child
 
@@ -67,7 +67,7 @@ class Da3Backend:
             BackendFailedError: the network's process crashed or ran out of memory.
             DepthNotFoundError: no view's depth fits what is known in millimetres.
         """
-        own = self._settings or settings_from_environment()
+        own = self._settings
         weights, code = own.find_weights(), own.code_path()
         posed = pose_photos(photos, corners, settings, workers=workers, progress=lambda share: progress(0.1 * share))
         progress(0.1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -33,7 +32,8 @@ SOURCE = "DA3-SMALL and DA3-BASE are published by depth-anything on Hugging Face
 
 @dataclass(frozen=True)
 class Da3Settings:
-    """One field a variable of :data:`VARIABLES`; the size is upstream's."""
+    """One field a variable of :data:`VARIABLES`; the size is upstream's. ``hash_cache``: a folder that keeps the sha256
+    of the weights."""
 
     weights: Path | None = None
     weights_sha256: str | None = None
@@ -42,6 +42,7 @@ class Da3Settings:
     device: str = "auto"
     size_px: int = 504
     batch: int = 12
+    hash_cache: Path | None = None
 
     @property
     def modules(self) -> tuple[str, ...]:
@@ -78,10 +79,17 @@ class Da3Settings:
                 advice=f"Name the published {WEIGHTS_FILE}, or its folder, in {PREFIX}WEIGHTS. {SOURCE}",
                 missing=WEIGHTS_FILE,
             )
-        return find_weights("Depth Anything 3", f"{PREFIX}WEIGHTS", path, pin=self.weights_sha256, source=SOURCE)
+        return find_weights(
+            "Depth Anything 3",
+            f"{PREFIX}WEIGHTS",
+            path,
+            pin=self.weights_sha256,
+            source=SOURCE,
+            hash_cache=self.hash_cache,
+        )
 
 
-def settings_from_environment(environment: Mapping[str, str] = os.environ) -> Da3Settings:
+def settings_from_environment(environment: Mapping[str, str]) -> Da3Settings:
     """The settings as the variables say.
 
     Raises:

@@ -28,7 +28,6 @@ from specimap_core.reconstruct.backends.mast3r.settings import (
     NAME,
     Mast3rSettings,
     check_home,
-    settings_from_environment,
     weights_of,
 )
 from specimap_core.reconstruct.backends.warnings import left_out, ran
@@ -45,12 +44,11 @@ LICENCE = (
 
 
 class Mast3rBackend:
-    """MASt3R-SfM, as the environment says (:data:`specimap_core.reconstruct.backends.mast3r.settings.VARIABLES`) by
-    default."""
+    """MASt3R-SfM from the checkout and with the weights that its settings name."""
 
     name = NAME
 
-    def __init__(self, settings: Mast3rSettings | None = None, script: Path | None = None) -> None:
+    def __init__(self, settings: Mast3rSettings, script: Path | None = None) -> None:
         self._settings = settings
         self._script = script
 
@@ -70,7 +68,7 @@ class Mast3rBackend:
             BackendFailedError: it crashed or ran out of memory.
             PhotosNotConnectedError, DepthNotFoundError, MarkerGeometryError, TooFewPhotosError: no solution.
         """
-        chosen = self._settings or settings_from_environment()
+        chosen = self._settings
         home, weights = check_home(chosen.home), weights_of(chosen)
         plan = plan_preparation(photos[0].size, chosen.size_px)
         images = np.stack([plan.apply(p.image) for p in photos])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -55,7 +54,8 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Mast3rSettings:
-    """One field a variable of :data:`VARIABLES`; the defaults are upstream's."""
+    """One field a variable of :data:`VARIABLES`; the defaults are upstream's. ``hash_cache``: a folder that keeps the
+    sha256 of the weights."""
 
     home: Path | None = None
     weights: Path | None = None
@@ -68,6 +68,7 @@ class Mast3rSettings:
     schedule: tuple[int, int] = (300, 300)
     confidence: float = 1.5
     cache: Path | None = None
+    hash_cache: Path | None = None
 
     @property
     def modules(self) -> tuple[str, ...]:
@@ -90,7 +91,7 @@ class Mast3rSettings:
         )
 
 
-def settings_from_environment(environment: Mapping[str, str] = os.environ) -> Mast3rSettings:
+def settings_from_environment(environment: Mapping[str, str]) -> Mast3rSettings:
     """The settings as the variables say.
 
     Raises:
@@ -166,4 +167,11 @@ def check_home(home: Path | None) -> Path:
 
 def weights_of(settings: Mast3rSettings) -> Weights:
     """The checkpoint that the settings name; raises as :func:`find_weights` does."""
-    return find_weights(NAME, f"{PREFIX}WEIGHTS", settings.weights, pin=settings.weights_sha256, source=SOURCE)
+    return find_weights(
+        NAME,
+        f"{PREFIX}WEIGHTS",
+        settings.weights,
+        pin=settings.weights_sha256,
+        source=SOURCE,
+        hash_cache=settings.hash_cache,
+    )
