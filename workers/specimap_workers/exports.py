@@ -30,7 +30,7 @@ from specimap_infra.storage import Storage
 from specimap_infra.tables import CloudRow, Export
 from specimap_workers.export_main import REFUSED
 from specimap_workers.stage_process import LAST_LINES
-from specimap_workers.workspaces import Cell, Cells, is_plain
+from specimap_workers.workspaces import Workspace, Workspaces, is_plain
 
 DOCUMENTS = (FileFormat.HTML, FileFormat.PDF)
 POLL_SECONDS = 0.1
@@ -60,15 +60,15 @@ def run_export(
     export = _claim(database, export_id, executor)
     if export is None:
         return
-    cells = Cells.of(settings, settings.scratch, "tmp")
-    cell = cells.new(f"{export_id}-{uuid4().hex[:8]}")
+    workspaces = Workspaces.of(settings, settings.scratch, "tmp")
+    workspace = workspaces.new(f"{export_id}-{uuid4().hex[:8]}")
     try:
         format = FileFormat(export.format)
-        target = cell.own / file_name(export.cloud_id, format)
-        labels_hash = _fetch(database, storage, export.cloud_id, format, cell.given)
-        _make(cells, cell, format, target, settings, lambda: _held(database, export_id, executor), cancelled)
+        target = workspace.own / file_name(export.cloud_id, format)
+        labels_hash = _fetch(database, storage, export.cloud_id, format, workspace.given)
+        _make(workspaces, workspace, format, target, settings, lambda: _held(database, export_id, executor), cancelled)
         # Each attempt has a place of its own: one that lost the row cannot replace the file that the row names.
-        key, size = f"exports/{export_id}/{cell.folder.stem}/{target.name}", target.stat().st_size
+        key, size = f"exports/{export_id}/{workspace.folder.stem}/{target.name}", target.stat().st_size
         storage.put_file(key, target)
         done = {"state": "succeeded", "storage_key": key, "size": size, "error": None, "labels_hash": labels_hash}
         if not _finish(database, export_id, executor, done):
@@ -86,11 +86,11 @@ def run_export(
         logger().error("export failed", export=export_id, code=failure.code, exc_info=error)
         described = failure.as_dict()
         # The path of a scratch folder says nothing to a client.
-        for folder in (cell.own, cell.given, cell.folder):
+        for folder in (workspace.own, workspace.given, workspace.folder):
             described["message"] = str(described["message"]).replace(f"{folder}/", "")
         _finish(database, export_id, executor, {"state": "failed", "error": described})
     finally:
-        cell.remove()
+        workspace.remove()
 
 
 class _LostError(Exception):
@@ -164,8 +164,8 @@ def _fetch_drawn(storage: Storage, prefix: str, work: Path) -> None:
 
 
 def _make(
-    cells: Cells,
-    cell: Cell,
+    workspaces: Workspaces,
+    workspace: Workspace,
     format: FileFormat,
     target: Path,
     settings: ServiceSettings,
@@ -180,8 +180,8 @@ def _make(
     """
     status = 0
     for _ in range(settings.starts):
-        status, answer = _run_once(cells, cell, format, target, settings, held, cancelled)
-        if status == 0 and is_plain(cell.own):
+        status, answer = _run_once(workspaces, workspace, format, target, settings, held, cancelled)
+        if status == 0 and is_plain(workspace.own):
             return
         if status == REFUSED:
             error = json.loads(answer)
@@ -204,8 +204,8 @@ class _RefusedError(SpecimapError):
 
 
 def _run_once(
-    cells: Cells,
-    cell: Cell,
+    workspaces: Workspaces,
+    workspace: Workspace,
     format: FileFormat,
     target: Path,
     settings: ServiceSettings,
@@ -216,22 +216,22 @@ def _run_once(
         sys.executable,
         "-m",
         "specimap_workers.export_main",
-        str(cell.given),
+        str(workspace.given),
         format.value,
         str(target),
         str(os.getpid()),
         str(settings.stage_memory_bytes),
     ]
-    with tempfile.TemporaryFile(dir=cell.folder) as answer, tempfile.TemporaryFile(dir=cell.folder) as said:
+    with tempfile.TemporaryFile(dir=workspace.folder) as answer, tempfile.TemporaryFile(dir=workspace.folder) as said:
         # A session of its own: a kill reaches whatever it starts, and the terminal's signals do not reach it. It holds
         # no file of the worker's: it could empty that of the log.
         process = subprocess.Popen(
-            cells.confined(command, cell, backends=False),
+            workspaces.confined(command, workspace, backends=False),
             stdin=subprocess.DEVNULL,
             stdout=answer,
             stderr=said,
             start_new_session=True,
-            env=cells.environment(cell),
+            env=workspaces.environment(workspace),
         )
         try:
             _wait(process, settings, held, cancelled)

@@ -214,7 +214,7 @@ class JobRun:
             process = await self._processes.take()
             self._processes.prepare()
             try:
-                with process.cell.holding(self._inputs, self._out) as (inputs, out):
+                with process.workspace.holding(self._inputs, self._out) as (inputs, out):
                     places = {"inputs": plan.inputs(inputs), "out": str(out)}
                     seconds = await self._watch(process, spec | places, stage)
                 if not await self._thread(is_plain, self._out):
@@ -231,18 +231,18 @@ class JobRun:
                 await process.end()
 
     async def _watch(self, process: StageProcess, spec: dict[str, Any], stage: str) -> float:
-        told = 0.0
+        last = 0.0
 
         async def progress(name: str, share: float) -> None:
-            nonlocal told
+            nonlocal last
             now = time.monotonic()
-            if name != stage or (now - told < PROGRESS_SECONDS and share < 1.0):
+            if name != stage or (now - last < PROGRESS_SECONDS and share < 1.0):
                 return
-            told = now
+            last = now
             try:
                 await asyncio.to_thread(self._report_progress, stage, share)
             except DatabaseUnavailableError:
-                logger().warning("progress not told: the database is away", job=self.job_id, stage=stage)
+                logger().warning("progress not written: the database is away", job=self.job_id, stage=stage)
 
         return await process.run(spec, progress, self._settings.stage_seconds)
 

@@ -17,7 +17,7 @@ from specimap_core.errors import SpecimapError
 from specimap_core.json_text import json_text
 from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES
 from specimap_infra.errors import StageTimeoutError
-from specimap_workers.workspaces import Cell, Cells
+from specimap_workers.workspaces import Workspace, Workspaces
 
 COMMAND = (sys.executable, "-m", "specimap_workers.stage_main")
 LAST_LINES = 40
@@ -46,18 +46,18 @@ class RefusedError(Exception):
 class StageProcess:
     """One process, for one stage."""
 
-    def __init__(self, process: asyncio.subprocess.Process, cell: Cell) -> None:
+    def __init__(self, process: asyncio.subprocess.Process, workspace: Workspace) -> None:
         self._process = process
-        self.cell = cell
+        self.workspace = workspace
         self._tail: deque[str] = deque(maxlen=LAST_LINES)
         self._reading = asyncio.create_task(self._read_errors())
 
     @classmethod
-    async def start(cls, command: Sequence[str], cells: Cells) -> StageProcess:
-        """Start it in a cell of its own; it loads its libraries meanwhile."""
-        cell = await asyncio.to_thread(cells.new)
+    async def start(cls, command: Sequence[str], workspaces: Workspaces) -> StageProcess:
+        """Start it in a workspace of its own; it loads its libraries meanwhile."""
+        workspace = await asyncio.to_thread(workspaces.new)
         process = await asyncio.create_subprocess_exec(
-            *await asyncio.to_thread(partial(cells.confined, command, cell, backends=True)),
+            *await asyncio.to_thread(partial(workspaces.confined, command, workspace, backends=True)),
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
@@ -65,9 +65,9 @@ class StageProcess:
             # A group of its own: a kill reaches whatever it starts, and the terminal's signals do not reach it.
             start_new_session=True,
             # A process that reads uploads sees no password, and of our variables what tells of backends alone.
-            env=cells.environment(cell, tuple(BACKEND_VARIABLES)),
+            env=workspaces.environment(workspace, tuple(BACKEND_VARIABLES)),
         )
-        return cls(process, cell)
+        return cls(process, workspace)
 
     @property
     def alive(self) -> bool:
@@ -122,9 +122,9 @@ class StageProcess:
         await self._reading
 
     async def end(self) -> None:
-        """The same, and remove its cell."""
+        """The same, and remove its workspace."""
         await self.kill()
-        await asyncio.to_thread(self.cell.remove)
+        await asyncio.to_thread(self.workspace.remove)
 
     async def _read_errors(self) -> None:
         assert self._process.stderr is not None
@@ -149,9 +149,9 @@ def _reason(code: int) -> str:
 class Processes:
     """Gives out processes and keeps some in reserve."""
 
-    def __init__(self, cells: Cells, command: Sequence[str] = COMMAND, *, memory_bytes: int = 0) -> None:
+    def __init__(self, workspaces: Workspaces, command: Sequence[str] = COMMAND, *, memory_bytes: int = 0) -> None:
         self._command = (*command, str(memory_bytes), str(os.getpid()))
-        self._cells = cells
+        self._cells = workspaces
         self._spares: list[StageProcess] = []
         self._starting: asyncio.Task[None] | None = None
 

@@ -26,7 +26,7 @@ from specimap_infra.confinement import check_confinement
 from specimap_infra.settings import load_settings
 from specimap_service.acquisitions.judge import Judge
 from specimap_workers.stage_process import Processes
-from specimap_workers.workspaces import Cells, is_plain
+from specimap_workers.workspaces import Workspaces, is_plain
 from tests.support import escapes
 
 pytestmark = pytest.mark.skipif(not protection().whole, reason="this kernel does not confine")
@@ -138,15 +138,15 @@ def in_stage(told: dict[str, Any], folder: Path, mode: Mode) -> dict[str, str]:
     inputs, out = folder / "inputs", folder / "out"
     (inputs / "photos").mkdir(parents=True)
     out.mkdir()
-    cells = Cells(folder / "work", "test", mode, (folder.parent / "data",))
+    workspaces = Workspaces(folder / "work", "test", mode, (folder.parent / "data",))
 
     async def heard(stage: str, share: float) -> None:
         del stage, share
 
     async def run() -> None:
-        processes = Processes(cells, (sys.executable, "-c", STAGE))
+        processes = Processes(workspaces, (sys.executable, "-c", STAGE))
         process = await processes.take()
-        with process.cell.holding(inputs, out) as (given, own):
+        with process.workspace.holding(inputs, out) as (given, own):
             link = linked(given / "photos", told)
             (given / "photos" / "told").write_text(json.dumps({**told, "link": str(link)}))
             spec = {"stage": "reconstruct", "inputs": {"photos": str(given / "photos")}, "out": str(own)}
@@ -160,12 +160,14 @@ def in_stage(told: dict[str, Any], folder: Path, mode: Mode) -> dict[str, str]:
 
 
 def in_export(told: dict[str, Any], folder: Path, mode: Mode) -> dict[str, str]:
-    cells = Cells(folder / "work", "test", mode, (folder.parent / "data",))
-    cell = cells.new()
-    said = json.dumps({**told, "own": str(cell.own), "link": str(linked(cell.given, told))})
-    command = cells.confined([sys.executable, "-c", EXPORT, said], cell, backends=False)
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=cells.environment(cell), check=True)
-    cell.remove()
+    workspaces = Workspaces(folder / "work", "test", mode, (folder.parent / "data",))
+    workspace = workspaces.new()
+    said = json.dumps({**told, "own": str(workspace.own), "link": str(linked(workspace.given, told))})
+    command = workspaces.confined([sys.executable, "-c", EXPORT, said], workspace, backends=False)
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=120, env=workspaces.environment(workspace), check=True
+    )
+    workspace.remove()
     return dict(json.loads(done.stdout))
 
 
@@ -219,16 +221,18 @@ def test_no_capability_is_left(tmp_path: Path) -> None:
         assert done.stdout.split() == ["0" * 16] * 5 + ["1"]
 
 
-def test_a_cell_gives_the_inputs_to_read_alone(tmp_path: Path) -> None:
-    cells = Cells(tmp_path / "work", "test", "require", (tmp_path,))
-    cell = cells.new()
-    (cell.given / "photo").write_text("original")
+def test_a_workspace_gives_the_inputs_to_read_alone(tmp_path: Path) -> None:
+    workspaces = Workspaces(tmp_path / "work", "test", "require", (tmp_path,))
+    workspace = workspaces.new()
+    (workspace.given / "photo").write_text("original")
     program = "import sys; print(open(sys.argv[1]).read()); open(sys.argv[1], 'a').write('changed')"
-    command = cells.confined([sys.executable, "-c", program, str(cell.given / "photo")], cell, backends=False)
+    command = workspaces.confined(
+        [sys.executable, "-c", program, str(workspace.given / "photo")], workspace, backends=False
+    )
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.stdout == "original\n"
     assert "PermissionError" in done.stderr
-    assert (cell.given / "photo").read_text() == "original"
+    assert (workspace.given / "photo").read_text() == "original"
 
 
 def test_stages_reach_what_the_environment_names_for_backends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -243,15 +247,15 @@ def test_stages_reach_what_the_environment_names_for_backends(tmp_path: Path, mo
     monkeypatch.setenv("SPECIMAP_DA3_WEIGHTS", str(weights))
     monkeypatch.setenv("SPECIMAP_MAST3R_HOME", str(home))
     monkeypatch.setenv("SPECIMAP_MAST3R_CACHE", str(cache))
-    cells = Cells(tmp_path / "work", "test", "require", ())
-    cell = cells.new()
+    workspaces = Workspaces(tmp_path / "work", "test", "require", ())
+    workspace = workspaces.new()
     program = (
         "import sys; print(open(sys.argv[1]).read(), open(sys.argv[2]).read());"
         "open(sys.argv[3], 'w').close(); open(sys.argv[2], 'w')"
     )
     places = [str(weights / "model.safetensors"), str(home / "code.py"), str(cache / "new")]
     for backends in (True, False):
-        command = cells.confined([sys.executable, "-c", program, *places], cell, backends=backends)
+        command = workspaces.confined([sys.executable, "-c", program, *places], workspace, backends=backends)
         done = subprocess.run(command, capture_output=True, text=True, timeout=60)
         assert "PermissionError" in done.stderr
         assert done.stdout == ("numbers code\n" if backends else "")
