@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import resource
-import signal
 import sys
 from pathlib import Path
 from typing import cast
@@ -16,10 +14,10 @@ from specimap_core.export import ExportFormat, export_cloud
 from specimap_core.export.archive import write_envi_zip, write_zarr_zip
 from specimap_core.export.formats import FileFormat
 from specimap_core.json_text import json_text
+from specimap_core.sandbox.lifetime import die_with
 
-PR_SET_PDEATHSIG = 1
 REFUSED = 2
-"""Exit status where the error is on standard output, as JSON."""
+"""Exit status where the error is on standard output, as a line of JSON."""
 
 
 def make_export_file(cloud_folder: Path, format: str, target: Path) -> Path:
@@ -49,11 +47,9 @@ def make_export_file(cloud_folder: Path, format: str, target: Path) -> Path:
 
 
 def main(arguments: list[str]) -> int:
-    """The process's own part: folder, format, target, the parent's id, most bytes of memory (0: no limit)."""
+    """Make one file. Arguments: folder, format, target, the parent's process id, most bytes of memory (0: no limit)."""
     folder, format, target, parent, memory = arguments
-    ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != int(parent):  # it ended before the line above
-        return 1
+    die_with(int(parent))
     if int(memory):
         resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))
     # Libraries that print would spoil the answer.
@@ -70,7 +66,7 @@ def main(arguments: list[str]) -> int:
     else:
         return 0
     with answer:
-        answer.write(json_text(refused.as_dict()))
+        answer.write(json_text(refused.as_dict()) + "\n")
     return REFUSED
 
 

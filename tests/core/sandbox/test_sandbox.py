@@ -53,7 +53,7 @@ from specimap_workers import stage_main
 def escape(spec, out):
     found = tried({{**json.loads((Path(spec["inputs"]["photos"]) / "told").read_text()), "own": spec["out"]}})
     (Path(spec["out"]) / "found").write_text(json.dumps(found))
-    stage_main._say(out, event="done", seconds=0)
+    stage_main._send(out, event="done", seconds=0)
 
 stage_main._run = escape
 stage_main.main()
