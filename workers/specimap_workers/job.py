@@ -39,7 +39,7 @@ SHEET = "photos.jpg"
 
 
 class JobRun:
-    """A job in the hands of one executor."""
+    """A job that one executor runs."""
 
     def __init__(
         self,
@@ -192,7 +192,7 @@ class JobRun:
             for name in (*RESULTS, *([SHEET] if (self._out / SHEET).exists() else [])):
                 shutil.move(self._out / name, aside / name)
             size = sum(p.stat().st_size for p in aside.rglob("*") if p.is_file())
-            # Read here, since it is at hand: the report does not say it.
+            # Read here, where the cloud is on the local disk: the report does not hold it.
             from specimap_core.cloud import Cloud
 
             bands = Cloud.open(aside / "cloud.zarr").bands

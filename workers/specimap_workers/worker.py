@@ -195,7 +195,7 @@ class Worker:
             fcntl.flock(self._note, fcntl.LOCK_EX)
         for path in work.glob("*.lock"):
             with suppress(OSError), open(path, encoding="ascii") as note:
-                # Held as long as its worker lives, in whatever container; process ids repeat.
+                # Locked as long as its worker lives, in whatever container; process ids repeat.
                 fcntl.flock(note, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 for folder in work.glob(f"*.{path.stem}"):
                     remove(folder)

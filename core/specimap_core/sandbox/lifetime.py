@@ -13,7 +13,7 @@ PR_SET_PDEATHSIG = 1
 def die_with(parent: int) -> None:
     """End this process when its parent, of that process id, ends, however that happens.
 
-    More exactly, when the parent's thread that started it ends. Linux alone offers that.
+    Precisely, when the thread that started it ends. Only Linux offers this; elsewhere nothing happens.
     """
     if sys.platform != "linux":
         return
