@@ -43,11 +43,11 @@ def made(service: Running, client: httpx.Client, result: Result, format: str) ->
     asked = client.post(address(result, format))
     assert asked.status_code == 202
     make(service, asked.json()["id"])
-    told = client.get(address(result, format)).json()
-    assert (told["state"], told["error"]) == ("succeeded", None), told
-    answer = client.get(told["links"]["content"])
+    export = client.get(address(result, format)).json()
+    assert (export["state"], export["error"]) == ("succeeded", None), export
+    answer = client.get(export["links"]["content"])
     assert answer.status_code == 200
-    assert told["size"] == len(answer.content)
+    assert export["size"] == len(answer.content)
     suffix = KINDS[FileFormat(format)].suffix
     assert answer.headers["content-disposition"] == f'attachment; filename="{result.cloud_id}.{suffix}"'
     return answer.content
@@ -69,21 +69,21 @@ def test_a_format_is_asked_for_once(service: Running, client: httpx.Client, resu
         answers = list(pool.map(lambda c: c.post(address(result, "las")), clients))
     assert {answer.status_code for answer in answers} == {202}
     (export_id,) = {answer.json()["id"] for answer in answers}
-    told = answers[0].json()
-    assert (told["state"], told["size"], told["format"]) == ("queued", None, "las")
+    export = answers[0].json()
+    assert (export["state"], export["size"], export["format"]) == ("queued", None, "las")
     assert queued(service) == [(export_id, MAKE_EXPORT, EXPORTS, 5)]
-    refused = client.get(told["links"]["content"])
+    refused = client.get(export["links"]["content"])
     assert (refused.status_code, refused.json()["code"]) == (409, "state_conflict")
     assert refused.json()["details"] == {"state": "queued"}
-    assert client.get(address(result, "las")).json() == told
+    assert client.get(address(result, "las")).json() == export
     assert [item["format"] for item in client.get(address(result, "").rstrip("/")).json()] == ["las", "mesh-ply"]
     audited = client.get("/v1/audit", params={"target": export_id}).json()["items"]
     assert [(e["action"], e["details"]) for e in audited] == [
         ("export.create", {"cloud": result.cloud_id, "format": "las"})
     ]
     make(service, export_id)
-    again = client.post(address(result, "las"))
-    assert (again.status_code, again.json()["id"], again.json()["state"]) == (200, export_id, "succeeded")
+    repeated = client.post(address(result, "las"))
+    assert (repeated.status_code, repeated.json()["id"], repeated.json()["state"]) == (200, export_id, "succeeded")
     assert len(queued(service)) == 1
 
 

@@ -95,9 +95,9 @@ def test_a_process_that_is_killed_is_started_again_and_then_failed(
         assert client.get(address(result, "ply") + "/content").status_code == 409
         os.kill(pid, signal.SIGKILL)
     working.join(20)
-    told = client.get(address(result, "ply")).json()
-    assert (told["state"], told["error"]["code"]) == ("failed", "worker_crashed")
-    assert told["error"]["details"] == {"stage": "export", "status": -9}
+    export = client.get(address(result, "ply")).json()
+    assert (export["state"], export["error"]["code"]) == ("failed", "worker_crashed")
+    assert export["error"]["details"] == {"stage": "export", "status": -9}
     assert client.get(address(result, "ply") + "/content").status_code == 409
     assert nothing_left(service)
 
@@ -110,9 +110,9 @@ def test_a_failed_one_is_tried_again_under_a_new_id(
     mesh.write_bytes(whole[:-100])
     first = client.post(address(result, "mesh-stl")).json()["id"]
     make(service, first)
-    told = client.get(address(result, "mesh-stl")).json()
-    assert (told["state"], told["error"]["code"]) == ("failed", "cloud_damaged")
-    assert str(service.settings.data_dir) not in str(told)
+    export = client.get(address(result, "mesh-stl")).json()
+    assert (export["state"], export["error"]["code"]) == ("failed", "cloud_damaged")
+    assert str(service.settings.data_dir) not in str(export)
     mesh.write_bytes(whole)
     second = client.post(address(result, "mesh-stl"))
     assert (second.status_code, second.json()["state"], second.json()["error"]) == (202, "queued", None)
@@ -245,12 +245,12 @@ def test_the_process_holds_nothing_of_the_worker(
     service: Running, client: httpx.Client, result: Result, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Its log, above all: a file that the worker writes could be emptied, a terminal read."""
-    told = tmp_path / "told"
+    identities = tmp_path / "identities"
     script = tmp_path / "taken.py"
     script.write_text(
         "import os, pathlib, sys\n"
         "files = [os.fstat(number) for number in range(3)]\n"
-        f"pathlib.Path({str(told)!r}).write_text(' '.join(f'{{f.st_dev}}:{{f.st_ino}}' for f in files))\n"
+        f"pathlib.Path({str(identities)!r}).write_text(' '.join(f'{{f.st_dev}}:{{f.st_ino}}' for f in files))\n"
         "pathlib.Path(sys.argv[3]).write_bytes(b'file')\n"
         "print('x' * 10_000_000)\n"
         "print('y' * 10_000_000, file=sys.stderr)\n"
@@ -266,7 +266,7 @@ def test_the_process_holds_nothing_of_the_worker(
     run_export(export_id, service.database, service.storage, service_settings, "worker-1")
     assert client.get(address(result, "ply")).json()["state"] == "succeeded"
     own = {f"{stat.st_dev}:{stat.st_ino}" for stat in map(os.fstat, range(3))} - {_of(os.devnull)}
-    given = told.read_text().split()
+    given = identities.read_text().split()
     assert given[0] == _of(os.devnull)
     assert not own & set(given)
 

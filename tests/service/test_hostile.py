@@ -121,7 +121,7 @@ def uploaded(service: Running, data: bytes, name: str) -> dict[str, Any]:
     return sent(client, new_acquisition(client), "cube", name, data)
 
 
-def told_secret(file: dict[str, Any]) -> bool:
+def shows_secret(file: dict[str, Any]) -> bool:
     text = json.dumps(file)
     return any(f"{value:g}" in text for value in SECRET_NM)
 
@@ -135,7 +135,7 @@ def test_a_file_that_leads_elsewhere_tells_nothing(kind: str, relative: bool, tm
     data = HOSTILE[kind](place, tmp_path)
     name = "x.tif" if kind == "ome" else "x.h5"
     with serving(tmp_path / "service") as service:
-        assert not told_secret(uploaded(service, data, name))
+        assert not shows_secret(uploaded(service, data, name))
 
 
 @pytest.mark.skipif(not protection().whole, reason="this kernel does not confine")
@@ -149,7 +149,7 @@ def test_confinement_holds_alone_where_a_reader_would_follow(kind: str, sandbox:
         judge._command = (sys.executable, "-c", NAIVE, *judge._command[3:])
         file = uploaded(service, data, "x.tif" if kind == "ome" else "x.h5")
     # Without it the reader follows, which shows that the file is what it should be.
-    assert told_secret(file) == (sandbox == "off" and (kind != "ome" or _follows(data, tmp_path)))
+    assert shows_secret(file) == (sandbox == "off" and (kind != "ome" or _follows(data, tmp_path)))
     if sandbox == "require" and kind in ("external", "linked"):  # of the others a library makes up values
         assert (file["state"], file["judgement"]["code"]) == ("refused", "judging_crashed")
 
@@ -193,7 +193,7 @@ def test_other_formats_that_name_paths_write_and_tell_nothing(tmp_path: Path) ->
     with serving(tmp_path / "service") as service:
         for name, data in files.items():
             file = uploaded(service, data, name)
-            assert not told_secret(file), name
+            assert not shows_secret(file), name
             assert SECRET.hex() not in json.dumps(file)
     assert not list(tmp_path.glob("made*"))
 
@@ -222,11 +222,11 @@ def test_photos_that_are_not_what_they_seem_tell_nothing(tmp_path: Path) -> None
         client = service.client(("upload", "read"))
         acquisition = new_acquisition(client)
         for name, data in files.items():
-            assert not told_secret(sent(client, acquisition, "photo", name, data)), name
+            assert not shows_secret(sent(client, acquisition, "photo", name, data)), name
         assert sent(client, acquisition, "photo", "good.jpg", photos()[0].read_bytes())["state"] == "accepted"
 
 
-# ---- what is believed of a child's answer --------------------------------------------------------------
+# ---- checks of a child's answer -------------------------------------------------------------------------
 
 PHOTO = {
     "verdict": "accepted",
@@ -244,7 +244,7 @@ WHOLE = {"verdict": "accepted", "code": None, "reason": "", "advice": "", "suffi
 
 
 @pytest.mark.parametrize(
-    "told",
+    "answer",
     [
         None,
         [],
@@ -262,15 +262,15 @@ WHOLE = {"verdict": "accepted", "code": None, "reason": "", "advice": "", "suffi
         {k: v for k, v in PHOTO.items() if k != "suffix"},
     ],
 )
-def test_an_answer_that_no_reader_gives_is_none(told: object) -> None:
+def test_an_answer_that_no_reader_gives_is_none(answer: object) -> None:
     with pytest.raises(ValueError):  # noqa: PT011 - the message is for nobody
-        checked_verdict("photo", told)
+        checked_verdict("photo", answer)
 
 
 def test_an_answer_is_shortened_and_its_wavelengths_are_plausible() -> None:
-    told = checked_verdict("photo", {**PHOTO, "reason": "a\x1b[31m" + "b" * 5000})
-    assert len(told["reason"]) <= LONGEST_TEXT
-    assert "\x1b" not in told["reason"]
+    verdict = checked_verdict("photo", {**PHOTO, "reason": "a\x1b[31m" + "b" * 5000})
+    assert len(verdict["reason"]) <= LONGEST_TEXT
+    assert "\x1b" not in verdict["reason"]
     for given, kept in (
         ([400, 1000.5], [400, 1000.5]),
         ([1000, 400], None),
@@ -323,11 +323,11 @@ def test_a_file_costs_its_own_copy_and_no_other_files_answer(tmp_path: Path) -> 
         first = judge.cube(folder / "good")
         for how in ("crash", "memory", "twice", "huge", "crash"):
             assert judge.cube(folder / how)["code"] == "judging_crashed", how
-            again = judge.cube(folder / "good")
-            assert again["verdict"] == "accepted"
-            assert again["pid"] not in (first["pid"], again["parent"])
+            second = judge.cube(folder / "good")
+            assert second["verdict"] == "accepted"
+            assert second["pid"] not in (first["pid"], second["parent"])
         # The same two children answered all of it.
-        assert len({again["parent"], first["parent"]}) <= 2
+        assert len({second["parent"], first["parent"]}) <= 2
         assert not list((tmp_path / "data" / "scratch" / "judging").iterdir())
     finally:
         judge.close()

@@ -154,9 +154,9 @@ def test_same_photo_twice(service: Running) -> None:
     acquisition = new_acquisition(client)
     data = SHARP[0].read_bytes()
     first = sent(client, acquisition, "photo", "a.jpg", data)
-    again = sent(client, acquisition, "photo", "b.jpg", data)
-    assert (again["state"], again["judgement"]["code"]) == ("refused", "photo_duplicate")
-    assert again["judgement"]["same_as"] == first["label"]
+    second = sent(client, acquisition, "photo", "b.jpg", data)
+    assert (second["state"], second["judgement"]["code"]) == ("refused", "photo_duplicate")
+    assert second["judgement"]["same_as"] == first["label"]
     client.delete(f"/v1/acquisitions/{acquisition}/files/{first['id']}")
     assert sent(client, acquisition, "photo", "c.jpg", data)["state"] == "accepted"
 

@@ -15,7 +15,7 @@ from specimap_core.export.formats import KINDS, FileFormat
 from specimap_core.report.document import write_document
 from specimap_workers import exports
 from specimap_workers.job import JobRun
-from specimap_workers.workspaces import Cell, Cells
+from specimap_workers.workspaces import Workspace, Workspaces
 from tests.support.document_scene import Page, folder_of, full_report
 from tests.support.export_scene import address, make
 from tests.support.result_scene import Result, put_result
@@ -79,9 +79,9 @@ def test_spectra_are_not_fetched(
     seen: list[str] = []
     inner = exports._make
 
-    def watched(cells: Cells, cell: Cell, *arguments: object) -> None:
-        seen.extend(str(path.relative_to(cell.given)) for path in cell.given.rglob("*") if path.is_file())
-        inner(cells, cell, *arguments)  # type: ignore[arg-type]
+    def watched(workspaces: Workspaces, workspace: Workspace, *arguments: object) -> None:
+        seen.extend(str(path.relative_to(workspace.given)) for path in workspace.given.rglob("*") if path.is_file())
+        inner(workspaces, workspace, *arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(exports, "_make", watched)
     made(service, client, result, "html")

@@ -158,8 +158,8 @@ def test_two_apis_and_three_workers_on_postgresql_and_s3(
                     client.headers["Authorization"] = f"Bearer {key}"
                     for job_id in ids:
                         row = yard.cloud(job_id)
-                        said = client.get(f"/v1/clouds/{row.id}").json()
-                        assert (said["points"], said["bands"]) == (row.points, 16)
+                        cloud = client.get(f"/v1/clouds/{row.id}").json()
+                        assert (cloud["points"], cloud["bands"]) == (row.points, 16)
                         point = client.get(f"/v1/clouds/{row.id}/points/17").json()
                         local = tmp_path / "copies" / row.id
                         if not local.exists():

@@ -114,9 +114,9 @@ def test_a_frozen_worker_that_wakes_up_changes_nothing(yard: Shop, small: OnDisk
     frozen.send_signal(signal.SIGCONT)
     until(partial(gone, pid), 20, "the end of the late stage")
     until(lambda: executor in yard.leases(), 20, "the frozen worker's heartbeat")
-    again = yard.submit(acquisition, r_pc=0.7)
+    later = yard.submit(acquisition, r_pc=0.7)
     awake.kill()
-    assert yard.ended(again).state == "succeeded", "the woken worker works on"
+    assert yard.ended(later).state == "succeeded", "the woken worker works on"
     assert yard.cloud(job_id).id == cloud.id
     assert len(yard.events(job_id, "state")) == events
     assert_same_cloud(yard, job_id, finished)

@@ -35,7 +35,7 @@ def main() -> int:
         database = Database.open(settings.database)
         migrate(database)
         database.close()
-        # Its imports are the slow ones: a wrong setting is told before them.
+        # Its imports are the slow ones: a wrong setting is reported before them.
         from specimap_workers.worker import Worker
 
         command = shlex.split(options.stage_command) if options.stage_command else COMMAND

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import resource
-import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from specimap_core.errors import SpecimapError
+from specimap_core.sandbox.lifetime import die_with
 from specimap_core.threads import limit_blas_threads
 
 if TYPE_CHECKING:
     from specimap_core.export import ExportFormat
 
-PR_SET_PDEATHSIG = 1
 REFUSED = 2
-"""Exit status where the error is on standard output, as JSON."""
+"""Exit status where the error is on standard output, as a line of JSON."""
 
 
 def make_export_file(cloud_folder: Path, format: str, target: Path) -> Path:
@@ -54,12 +52,10 @@ def make_export_file(cloud_folder: Path, format: str, target: Path) -> Path:
 
 
 def main(arguments: list[str]) -> int:
-    """The process's own part: folder, format, target, the parent's id, most bytes of memory (0: no limit)."""
+    """Make one file. Arguments: folder, format, target, the parent's process id, most bytes of memory (0: no limit)."""
     limit_blas_threads()
     folder, format, target, parent, memory = arguments
-    ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != int(parent):  # it ended before the line above
-        return 1
+    die_with(int(parent))
     if int(memory):
         resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))
     # Libraries that print would spoil the answer.
@@ -78,7 +74,7 @@ def main(arguments: list[str]) -> int:
     from specimap_core.json_text import json_text
 
     with answer:
-        answer.write(json_text(refused.as_dict()))
+        answer.write(json_text(refused.as_dict()) + "\n")
     return REFUSED
 
 

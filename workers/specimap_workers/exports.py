@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
-import signal
-import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 from uuid import uuid4
 
 import sqlalchemy as sa
@@ -21,6 +17,7 @@ from specimap_core.atomic import remove
 from specimap_core.cloud.schema import ARRAYS
 from specimap_core.errors import CancelledError, NotFoundError, SpecimapError
 from specimap_core.export.formats import FileFormat, file_name
+from specimap_core.sandbox.json_lines import InvalidMessageError, JsonLineProcess, ProcessEndedError
 from specimap_infra.database import Database
 from specimap_infra.errors import DatabaseUnavailableError, StageTimeoutError, WorkerCrashedError
 from specimap_infra.labels import current_labels, fingerprint
@@ -29,15 +26,12 @@ from specimap_infra.settings import ServiceSettings
 from specimap_infra.storage import Storage
 from specimap_infra.tables import CloudRow, Export
 from specimap_workers.export_main import REFUSED
-from specimap_workers.stage_process import LAST_LINES
-from specimap_workers.workspaces import Cell, Cells, is_plain
+from specimap_workers.workspaces import Workspace, Workspaces, is_plain
 
 DOCUMENTS = (FileFormat.HTML, FileFormat.PDF)
 POLL_SECONDS = 0.1
 HELD_SECONDS = 2.0
 """How often a running export's row is asked whether it still is this executor's."""
-LARGEST_ANSWER = 1 << 16
-"""Bytes that are read of what the process says: it may have been taken over."""
 
 
 def run_export(
@@ -60,15 +54,15 @@ def run_export(
     export = _claim(database, export_id, executor)
     if export is None:
         return
-    cells = Cells.of(settings, settings.scratch, "tmp")
-    cell = cells.new(f"{export_id}-{uuid4().hex[:8]}")
+    workspaces = Workspaces.of(settings, settings.scratch, "tmp")
+    workspace = workspaces.new(f"{export_id}-{uuid4().hex[:8]}")
     try:
         format = FileFormat(export.format)
-        target = cell.own / file_name(export.cloud_id, format)
-        labels_hash = _fetch(database, storage, export.cloud_id, format, cell.given)
-        _make(cells, cell, format, target, settings, lambda: _held(database, export_id, executor), cancelled)
+        target = workspace.own / file_name(export.cloud_id, format)
+        labels_hash = _fetch(database, storage, export.cloud_id, format, workspace.given)
+        _make(workspaces, workspace, format, target, settings, lambda: _held(database, export_id, executor), cancelled)
         # Each attempt has a place of its own: one that lost the row cannot replace the file that the row names.
-        key, size = f"exports/{export_id}/{cell.folder.stem}/{target.name}", target.stat().st_size
+        key, size = f"exports/{export_id}/{workspace.folder.stem}/{target.name}", target.stat().st_size
         storage.put_file(key, target)
         done = {"state": "succeeded", "storage_key": key, "size": size, "error": None, "labels_hash": labels_hash}
         if not _finish(database, export_id, executor, done):
@@ -85,12 +79,12 @@ def run_export(
         )
         logger().error("export failed", export=export_id, code=failure.code, exc_info=error)
         described = failure.as_dict()
-        # The path of a scratch folder says nothing to a client.
-        for folder in (cell.own, cell.given, cell.folder):
+        # The path of a scratch folder means nothing to a client.
+        for folder in (workspace.own, workspace.given, workspace.folder):
             described["message"] = str(described["message"]).replace(f"{folder}/", "")
         _finish(database, export_id, executor, {"state": "failed", "error": described})
     finally:
-        cell.remove()
+        workspace.remove()
 
 
 class _LostError(Exception):
@@ -164,8 +158,8 @@ def _fetch_drawn(storage: Storage, prefix: str, work: Path) -> None:
 
 
 def _make(
-    cells: Cells,
-    cell: Cell,
+    workspaces: Workspaces,
+    workspace: Workspace,
     format: FileFormat,
     target: Path,
     settings: ServiceSettings,
@@ -180,11 +174,10 @@ def _make(
     """
     status = 0
     for _ in range(settings.starts):
-        status, answer = _run_once(cells, cell, format, target, settings, held, cancelled)
-        if status == 0 and is_plain(cell.own):
+        status, error = _run_once(workspaces, workspace, format, target, settings, held, cancelled)
+        if status == 0 and is_plain(workspace.own):
             return
         if status == REFUSED:
-            error = json.loads(answer)
             raise _RefusedError(error)
         logger().warning("export process ended", format=format.value, status=status)
     raise WorkerCrashedError(
@@ -204,75 +197,52 @@ class _RefusedError(SpecimapError):
 
 
 def _run_once(
-    cells: Cells,
-    cell: Cell,
+    workspaces: Workspaces,
+    workspace: Workspace,
     format: FileFormat,
     target: Path,
     settings: ServiceSettings,
     held: Callable[[], bool],
     cancelled: Callable[[], bool],
-) -> tuple[int, str]:
+) -> tuple[int, dict[str, Any]]:
+    """The exit status of one process, and the error that it described."""
     command = [
         sys.executable,
         "-m",
         "specimap_workers.export_main",
-        str(cell.given),
+        str(workspace.given),
         format.value,
         str(target),
         str(os.getpid()),
         str(settings.stage_memory_bytes),
     ]
-    with tempfile.TemporaryFile(dir=cell.folder) as answer, tempfile.TemporaryFile(dir=cell.folder) as said:
-        # A session of its own: a kill reaches whatever it starts, and the terminal's signals do not reach it. It holds
-        # no file of the worker's: it could empty that of the log.
-        process = subprocess.Popen(
-            cells.confined(command, cell, backends=False),
-            stdin=subprocess.DEVNULL,
-            stdout=answer,
-            stderr=said,
-            start_new_session=True,
-            env=cells.environment(cell),
-        )
-        try:
-            _wait(process, settings, held, cancelled)
-        finally:
-            if process.poll() is None:
-                with suppress(ProcessLookupError):
-                    os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
-        if process.returncode not in (0, REFUSED):
-            for line in _last(said).splitlines()[-LAST_LINES:]:
-                logger().error("export's last lines", line=line[:500])
-        return process.returncode, _last(answer)
-
-
-def _wait(
-    process: subprocess.Popen[bytes],
-    settings: ServiceSettings,
-    held: Callable[[], bool],
-    cancelled: Callable[[], bool],
-) -> None:
+    error: dict[str, Any] = {}
     start = asked = time.monotonic()
-    while True:
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(POLL_SECONDS)
-            return
-        now = time.monotonic()
-        if cancelled():
-            raise CancelledError("The export was stopped.", advice="It is made when a worker takes it up again.")
-        if now - start > settings.stage_seconds:
-            raise StageTimeoutError(
-                f"The export took longer than {settings.stage_seconds:.0f} s.",
-                advice="Raise SPECIMAP_STAGE_SECONDS.",
-                stage="export",
-            )
-        if now - asked > HELD_SECONDS:
-            asked = now
-            if not held():
-                raise _LostError
-
-
-def _last(file: IO[bytes]) -> str:
-    """The end of what a process wrote."""
-    file.seek(max(0, file.seek(0, os.SEEK_END) - LARGEST_ANSWER))
-    return file.read(LARGEST_ANSWER).decode("utf-8", "replace")
+    # It holds no file of the worker's: it could empty that of the log.
+    with JsonLineProcess(
+        workspaces.confined(command, workspace, backends=False),
+        env=workspaces.environment(workspace),
+        takes_messages=False,
+    ) as process:
+        while True:
+            try:
+                error = process.receive(POLL_SECONDS)
+            except (TimeoutError, InvalidMessageError):
+                pass
+            except ProcessEndedError as end:
+                for line in end.tail if end.status not in (0, REFUSED) else ():
+                    logger().error("export's last lines", line=line)
+                return end.status, error
+            now = time.monotonic()
+            if cancelled():
+                raise CancelledError("The export was stopped.", advice="It is made when a worker takes it up again.")
+            if now - start > settings.stage_seconds:
+                raise StageTimeoutError(
+                    f"The export took longer than {settings.stage_seconds:.0f} s.",
+                    advice="Raise SPECIMAP_STAGE_SECONDS.",
+                    stage="export",
+                )
+            if now - asked > HELD_SECONDS:
+                asked = now
+                if not held():
+                    raise _LostError

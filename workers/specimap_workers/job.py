@@ -40,7 +40,7 @@ SHEET = "photos.jpg"
 
 
 class JobRun:
-    """A job in the hands of one executor."""
+    """A job that one executor runs."""
 
     def __init__(
         self,
@@ -195,7 +195,7 @@ class JobRun:
             for name in (*RESULTS, *([SHEET] if (self._out / SHEET).exists() else [])):
                 shutil.move(self._out / name, aside / name)
             size = sum(p.stat().st_size for p in aside.rglob("*") if p.is_file())
-            # Read here, since it is at hand: the report does not say it.
+            # Read here, where the cloud is on the local disk: the report does not hold it.
             from specimap_core.cloud import Cloud
 
             bands = Cloud.open(aside / "cloud.zarr").bands
@@ -217,7 +217,7 @@ class JobRun:
             process = await self._processes.take()
             self._processes.prepare()
             try:
-                with process.cell.holding(self._inputs, self._out) as (inputs, out):
+                with process.workspace.holding(self._inputs, self._out) as (inputs, out):
                     places = {"inputs": plan.inputs(inputs), "out": str(out)}
                     seconds = await self._watch(process, spec | places, stage)
                 if not await self._thread(is_plain, self._out):
@@ -234,18 +234,18 @@ class JobRun:
                 await process.end()
 
     async def _watch(self, process: StageProcess, spec: dict[str, Any], stage: str) -> float:
-        told = 0.0
+        last = 0.0
 
         async def progress(name: str, share: float) -> None:
-            nonlocal told
+            nonlocal last
             now = time.monotonic()
-            if name != stage or (now - told < PROGRESS_SECONDS and share < 1.0):
+            if name != stage or (now - last < PROGRESS_SECONDS and share < 1.0):
                 return
-            told = now
+            last = now
             try:
                 await asyncio.to_thread(self._report_progress, stage, share)
             except DatabaseUnavailableError:
-                logger().warning("progress not told: the database is away", job=self.job_id, stage=stage)
+                logger().warning("progress not written: the database is away", job=self.job_id, stage=stage)
 
         return await process.run(spec, progress, self._settings.stage_seconds)
 

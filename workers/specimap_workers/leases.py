@@ -1,4 +1,4 @@
-"""Leases: each worker says every other second that it lives; the work of one that fell silent goes to others.
+"""Leases: each worker renews its own every other second; the work of one that stops doing so goes to others.
 
 Lives and deaths are judged by the database's clock. A wrong judgement costs a stage run twice, never a job: the engine
 and the jobs' rows refuse what a worker writes that has lost its lease.
@@ -20,7 +20,7 @@ from specimap_infra.tables import Lease
 
 
 class LeaseKeeper:
-    """Renews one worker's lease in a thread, and calls ``look_after`` now and then, where it may judge others."""
+    """Renews one worker's lease in a thread, and calls ``look_after`` now and then, when it may judge others."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""What a job works on: its files, its settings, and the keys of its stages; all from the database's rows."""
+"""The inputs of a job: its files, its settings, and the keys of its stages; all from the database's rows."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Plan:
         for role in ("cube", "white", "dark"):
             paths = sorted(p for p in self.files if p.startswith(f"{role}/"))
             if paths:
-                # An ENVI header speaks for the data beside it.
+                # An ENVI header stands for its data, too.
                 found[role] = str(folder / next((p for p in paths if p.endswith(".hdr")), paths[0]))
         return found
 

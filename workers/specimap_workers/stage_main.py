@@ -1,4 +1,4 @@
-"""A stage's own process: waits for one stage on standard input, runs it, tells how it goes on standard output.
+"""A stage's own process: waits for one stage on standard input, runs it, reports its progress on standard output.
 
 A process for each stage keeps the worker's heartbeats off the interpreter lock, gives memory back for certain, and
 can be killed at any time. It loads the libraries before the stage comes, so that a stage finds it warm.
@@ -18,7 +18,7 @@ from specimap_core.sandbox.lifetime import die_with
 from specimap_core.threads import limit_blas_threads
 
 
-def _say(out: TextIO, **event: object) -> None:
+def _send(out: TextIO, **event: object) -> None:
     # Imported late, since it loads numpy.
     from specimap_core.json_text import json_text
 
@@ -58,8 +58,8 @@ def _run(spec: dict[str, Any], out: TextIO) -> None:
         spec["workers"],
         backends,
     )
-    seconds = run_stage(run, progress=lambda stage, share: _say(out, event="progress", stage=stage, share=share))
-    _say(out, event="done", seconds=seconds)
+    seconds = run_stage(run, progress=lambda stage, share: _send(out, event="progress", stage=stage, share=share))
+    _send(out, event="done", seconds=seconds)
 
 
 def main() -> None:
@@ -67,14 +67,14 @@ def main() -> None:
     limit_blas_threads()
     memory_bytes, parent = (int(value) for value in sys.argv[1:3])
     die_with(parent)
-    # Libraries that print would break the lines that the worker reads.
+    # Libraries that print must not get between the lines that the worker reads.
     out = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if memory_bytes:
         resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
     _load()
-    _say(out, event="ready")
+    _send(out, event="ready")
     line = sys.stdin.readline()
     if not line:
         return
@@ -83,16 +83,16 @@ def main() -> None:
     try:
         _run(json.loads(line), out)
     except SpecimapError as error:
-        _say(out, event="failed", error=error.as_dict())
+        _send(out, event="failed", error=error.as_dict())
     except OSError as error:
         if error.errno != 28:
             raise
         full = StorageFullError("The disk filled up.", advice="Free space; finished stages are kept.")
-        _say(out, event="failed", error=full.as_dict())
+        _send(out, event="failed", error=full.as_dict())
 
 
 if __name__ == "__main__":
     main()
-    # Native libraries' threads may hang in the interpreter's end; all results are on the disk.
+    # Native libraries' threads may block the interpreter's end; all results are on the disk.
     sys.stdout.flush()
     os._exit(0)

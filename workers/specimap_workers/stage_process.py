@@ -1,29 +1,27 @@
-"""Processes for stages: one is always kept ready, so that a stage does not wait for imports."""
+"""Processes for stages: some are always kept ready, so that a stage does not wait for imports."""
 
 from __future__ import annotations
 
 import asyncio
-import json
 import os
 import signal
 import sys
-from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any
 
 from specimap_core.errors import SpecimapError
-from specimap_core.json_text import json_text
 from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES
+from specimap_core.sandbox.json_lines import JsonLineProcess, ProcessEndedError, end_text
 from specimap_infra.errors import StageTimeoutError
-from specimap_workers.workspaces import Cell, Cells
+from specimap_workers.workspaces import Workspace, Workspaces
 
 COMMAND = (sys.executable, "-m", "specimap_workers.stage_main")
-LAST_LINES = 40
 SPARES = 2
 """One for the next stage and one for that after it: rendering takes a tenth of a second, less than an import."""
-LINE_LIMIT = 1 << 20
+TICK_SECONDS = 0.2
+"""Longest time that a thread waits for a line: a thread cannot be cancelled."""
 
 
 class StageCrashedError(Exception):
@@ -46,33 +44,24 @@ class RefusedError(Exception):
 class StageProcess:
     """One process, for one stage."""
 
-    def __init__(self, process: asyncio.subprocess.Process, cell: Cell) -> None:
+    def __init__(self, process: JsonLineProcess, workspace: Workspace) -> None:
         self._process = process
-        self.cell = cell
-        self._tail: deque[str] = deque(maxlen=LAST_LINES)
-        self._reading = asyncio.create_task(self._read_errors())
+        self.workspace = workspace
 
     @classmethod
-    async def start(cls, command: Sequence[str], cells: Cells) -> StageProcess:
-        """Start it in a cell of its own; it loads its libraries meanwhile."""
-        cell = await asyncio.to_thread(cells.new)
-        process = await asyncio.create_subprocess_exec(
-            *await asyncio.to_thread(partial(cells.confined, command, cell, backends=True)),
-            stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.PIPE,
-            limit=LINE_LIMIT,
-            # A group of its own: a kill reaches whatever it starts, and the terminal's signals do not reach it.
-            start_new_session=True,
-            # A process that reads uploads sees no password, and of our variables what tells of backends alone.
-            env=cells.environment(cell, tuple(BACKEND_VARIABLES)),
-        )
-        return cls(process, cell)
+    async def start(cls, command: Sequence[str], workspaces: Workspaces) -> StageProcess:
+        """Start it in a workspace of its own; it loads its libraries meanwhile."""
+        workspace = await asyncio.to_thread(workspaces.new)
+        confined = await asyncio.to_thread(partial(workspaces.confined, command, workspace, backends=True))
+        # It reads uploads, so it sees no password, and of Specimap's variables those of the backends alone. It is
+        # started in this thread, not in one of a pool: it ends with the thread that started it.
+        process = JsonLineProcess(confined, env=workspaces.environment(workspace, tuple(BACKEND_VARIABLES)))
+        return cls(process, workspace)
 
     @property
     def alive(self) -> bool:
         """Whether it has not ended."""
-        return self._process.returncode is None
+        return self._process.alive
 
     async def run(
         self, spec: dict[str, Any], progress: Callable[[str, float], Awaitable[None]], seconds: float
@@ -86,7 +75,8 @@ class StageProcess:
         """
         try:
             async with asyncio.timeout(seconds):
-                return await self._answer(spec, progress)
+                await asyncio.to_thread(self._process.send, spec, seconds)
+                return await self._answer(progress)
         except TimeoutError:
             raise StageTimeoutError(
                 f"Stage {spec['stage']} took longer than {seconds:.0f} s.",
@@ -96,62 +86,43 @@ class StageProcess:
         finally:
             await self.kill()
 
-    async def _answer(self, spec: dict[str, Any], progress: Callable[[str, float], Awaitable[None]]) -> float:
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        with suppress(ConnectionError):  # it has ended: the reading below tells how
-            self._process.stdin.write(json_text(spec).encode() + b"\n")
-            await self._process.stdin.drain()
-        async for line in self._process.stdout:
-            event = json.loads(line)
+    async def _answer(self, progress: Callable[[str, float], Awaitable[None]]) -> float:
+        while True:
+            try:
+                event = await asyncio.to_thread(self._process.receive, TICK_SECONDS)
+            except TimeoutError:
+                continue
+            except ProcessEndedError as end:
+                raise StageCrashedError(_reason(end.status), end.tail) from end
             if event["event"] == "progress":
                 await progress(event["stage"], event["share"])
             elif event["event"] == "done":
                 return float(event["seconds"])
             elif event["event"] == "failed":
                 raise RefusedError(event["error"])
-        code = await self._process.wait()
-        await self._reading
-        raise StageCrashedError(_reason(code), self._tail)
 
     async def kill(self) -> None:
         """End it and all it started, at once."""
-        with suppress(ProcessLookupError):
-            os.killpg(self._process.pid, signal.SIGKILL)
-        await self._process.wait()
-        await self._reading
+        self._process.kill()
+        await asyncio.to_thread(self._process.close)
 
     async def end(self) -> None:
-        """The same, and remove its cell."""
+        """The same, and remove its workspace."""
         await self.kill()
-        await asyncio.to_thread(self.cell.remove)
-
-    async def _read_errors(self) -> None:
-        assert self._process.stderr is not None
-        while True:
-            try:
-                line = await self._process.stderr.readline()
-            except ValueError:  # a line beyond the limit
-                continue
-            if not line:
-                return
-            self._tail.append(line.decode(errors="replace").rstrip()[:500])
+        await asyncio.to_thread(self.workspace.remove)
 
 
-def _reason(code: int) -> str:
-    if code < 0:
-        name = signal.Signals(-code).name if -code in signal.valid_signals() else str(-code)
-        hint = " (often: out of memory)" if -code == signal.SIGKILL else ""
-        return f"was ended by {name}{hint}"
-    return f"ended with status {code}"
+def _reason(status: int) -> str:
+    hint = " (often: out of memory)" if status == -signal.SIGKILL else ""
+    return f"{'was ended' if status < 0 else 'ended'} {end_text(status)}{hint}"
 
 
 class Processes:
     """Gives out processes and keeps some in reserve."""
 
-    def __init__(self, cells: Cells, command: Sequence[str] = COMMAND, *, memory_bytes: int = 0) -> None:
+    def __init__(self, workspaces: Workspaces, command: Sequence[str] = COMMAND, *, memory_bytes: int = 0) -> None:
         self._command = (*command, str(memory_bytes), str(os.getpid()))
-        self._cells = cells
+        self._workspaces = workspaces
         self._spares: list[StageProcess] = []
         self._starting: asyncio.Task[None] | None = None
 
@@ -164,7 +135,7 @@ class Processes:
             if spare.alive:
                 return spare
             await spare.end()
-        return await StageProcess.start(self._command, self._cells)
+        return await StageProcess.start(self._command, self._workspaces)
 
     def prepare(self) -> None:
         """Start processes for the next stages, until enough are there."""
@@ -173,7 +144,7 @@ class Processes:
 
     async def _prepare(self) -> None:
         while len(self._spares) < SPARES:
-            self._spares.append(await StageProcess.start(self._command, self._cells))
+            self._spares.append(await StageProcess.start(self._command, self._workspaces))
 
     async def close(self) -> None:
         """End those in reserve."""

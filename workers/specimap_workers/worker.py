@@ -40,7 +40,7 @@ from specimap_workers.job import STAGES, JobRun
 from specimap_workers.leases import LeaseKeeper
 from specimap_workers.reaper import Reaper
 from specimap_workers.stage_process import COMMAND, Processes
-from specimap_workers.workspaces import Cells
+from specimap_workers.workspaces import Workspaces
 
 DELIVERY_SECONDS = 1.0
 SWEEP_SECONDS = 15.0
@@ -63,8 +63,8 @@ class Worker:
         self.executor = f"{socket.gethostname()}:{slot}:{uuid.uuid4().hex[:12]}"
         self._database = Database.open(settings.database)
         self._storage = Storage.open(settings)
-        cells = Cells.of(settings, settings.scratch / "work", self._suffix, backends)
-        self._processes = Processes(cells, command, memory_bytes=settings.stage_memory_bytes)
+        workspaces = Workspaces.of(settings, settings.scratch / "work", self._suffix, backends)
+        self._processes = Processes(workspaces, command, memory_bytes=settings.stage_memory_bytes)
         self._kind = kind
         self._stopping = threading.Event()
         self._note: TextIO | None = None
@@ -204,7 +204,7 @@ class Worker:
             fcntl.flock(self._note, fcntl.LOCK_EX)
         for path in work.glob("*.lock"):
             with suppress(OSError), open(path, encoding="ascii") as note:
-                # Held as long as its worker lives, in whatever container; process ids repeat.
+                # Locked as long as its worker lives, in whatever container; process ids repeat.
                 fcntl.flock(note, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 for folder in work.glob(f"*.{path.stem}"):
                     remove(folder)

@@ -1,7 +1,8 @@
-"""Cells: where a stage's or an export's process works, and all that it reaches beside its program.
+"""Workspaces: the folders that a stage's or an export's process reaches, apart from its program.
 
-A process gives up the rest before it loads a library, so before it is known which job it will serve. So the job comes
-to the process: its folders are moved into the cell for the time of a stage, and back after it.
+A process gives up access to everything else before it loads a library, and so before it is known which job it will
+serve. So the job comes to the process: its folders are moved into the workspace for the time of a stage, and back
+after it.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from specimap_infra.settings import ServiceSettings
 
 
 @dataclass(frozen=True)
-class Cell:
+class Workspace:
     """``given``: what the process may read; ``own``: what it may write; ``scratch``: its temporary files."""
 
     folder: Path
@@ -45,7 +46,7 @@ class Cell:
 
     @contextmanager
     def holding(self, inputs: Path, out: Path) -> Iterator[tuple[Path, Path]]:
-        """Have a job's folders in the cell, ``inputs`` to read and ``out`` to write; gives their places there.
+        """Have a job's folders in the workspace, ``inputs`` to read and ``out`` to write; gives their places there.
 
         They are moved back when the block ends; by then the process has ended, or its hold on them has.
         """
@@ -68,8 +69,8 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Cells:
-    """Makes cells in a folder, as ``<number>.<suffix>``, and commands that are confined to one."""
+class Workspaces:
+    """Makes workspaces in a folder, as ``<name>.<suffix>``, and commands that are confined to one."""
 
     folder: Path
     suffix: str
@@ -80,27 +81,29 @@ class Cells:
     @classmethod
     def of(
         cls, settings: ServiceSettings, folder: Path, suffix: str, backends: BackendSettings = UNCONFIGURED
-    ) -> Cells:
+    ) -> Workspaces:
         """As the settings say."""
         return cls(folder, suffix, settings.sandbox, settings.private_places, backends)
 
-    def new(self, name: str = "") -> Cell:
-        """An empty cell; of a name that is not there yet, or none."""
-        cell = Cell(self.folder / f"{name or f'cell-{uuid.uuid4().hex[:12]}'}.{self.suffix}")
-        for part in (cell.given, cell.own, cell.scratch):
+    def new(self, name: str = "") -> Workspace:
+        """An empty workspace, by default under a new name; ``name`` must not be there yet."""
+        workspace = Workspace(self.folder / f"{name or f'workspace-{uuid.uuid4().hex[:12]}'}.{self.suffix}")
+        for part in (workspace.given, workspace.own, workspace.scratch):
             with disk_errors(part):
                 part.mkdir(parents=True, mode=0o700)
-        return cell
+        return workspace
 
-    def confined(self, command: Sequence[str], cell: Cell, *, backends: bool) -> list[str]:
-        """The command, which reaches the cell alone, and with ``backends`` what the settings name of these."""
+    def confined(self, command: Sequence[str], workspace: Workspace, *, backends: bool) -> list[str]:
+        """The command, which reaches the workspace alone, and with ``backends`` what the settings name of these."""
         more = backend_reach(self.backends) if backends and self.mode != "off" else Reach()
-        reach = Reach((*more.read, cell.given), (*more.write, cell.own, cell.scratch), more.run, self.private)
+        reach = Reach(
+            (*more.read, workspace.given), (*more.write, workspace.own, workspace.scratch), more.run, self.private
+        )
         return confined(command, reach, self.mode)
 
-    def environment(self, cell: Cell, keep: Sequence[str] = ()) -> dict[str, str]:
+    def environment(self, workspace: Workspace, keep: Sequence[str] = ()) -> dict[str, str]:
         """Without secrets, with a place for temporary files."""
-        return {**bare_environment(keep), "TMPDIR": str(cell.scratch)}
+        return {**bare_environment(keep), "TMPDIR": str(workspace.scratch)}
 
 
 def backend_reach(backends: BackendSettings) -> Reach:

@@ -1,10 +1,11 @@
 """The child's side of :mod:`specimap_core.sandbox.process`: runs a script of ours in another interpreter.
 
 Run as a program: ``python child.py FOLDER DESCRIPTOR``. The interpreter needs NumPy and what the script needs, and
-need not have Specimap installed: of it, only this file's own package is reachable, without what was installed beside.
+need not have Specimap installed: of it, only this file's own package can be imported, without the packages that are
+installed next to it.
 
-The script is a module with ``run(request, arrays, step)``, which returns arrays and facts (JSON values). It tells how
-far it is by ``step(name, share)`` and refuses by raising leaves of SpecimapError.
+The script is a module with ``run(request, arrays, step)``, which returns arrays and facts (JSON values). It reports
+its progress with ``step(name, share)`` and refuses by raising leaves of SpecimapError.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ Run = Callable[[dict[str, Any], dict[str, Any], Step], "tuple[Arrays, Mapping[st
 
 
 def expose_package() -> None:
-    """Make ``specimap_core`` importable where it is not installed, without the packages that lie beside it."""
+    """Make ``specimap_core`` importable where it is not installed, without the packages that lie next to it."""
     package = ModuleType("specimap_core")
     package.__path__ = [str(Path(__file__).resolve().parents[1])]
     sys.modules["specimap_core"] = package
@@ -70,8 +71,8 @@ def refuse_network() -> None:
     sys.addaudithook(hook)
 
 
-def told(error: BaseException) -> dict[str, Any]:
-    """An error as the parent reads it: ``SpecimapError.as_dict`` with codes of this module's own for the rest."""
+def error_fields(error: BaseException) -> dict[str, Any]:
+    """An error as the parent reads it: as of ``SpecimapError.as_dict``, for other errors with codes of this module."""
     from specimap_core.errors import SpecimapError
 
     if isinstance(error, SpecimapError):
@@ -88,13 +89,13 @@ def told(error: BaseException) -> dict[str, Any]:
     return {"code": "crash", "message": text, "details": {"at": at}}
 
 
-def _lines(descriptor: int) -> Callable[..., None]:
+def _sender(descriptor: int) -> Callable[..., None]:
     os.set_inheritable(descriptor, False)
 
-    def say(**event: object) -> None:
+    def send(**event: object) -> None:
         os.write(descriptor, (json.dumps(event, default=str) + "\n").encode())
 
-    return say
+    return send
 
 
 def _script(path: str) -> Run:
@@ -117,7 +118,7 @@ def _causes(error: BaseException) -> Iterator[BaseException]:
 
 def main() -> None:
     """Answer one request."""
-    folder, say = Path(sys.argv[1]), _lines(int(sys.argv[2]))
+    folder, send = Path(sys.argv[1]), _sender(int(sys.argv[2]))
     end_with_parent(folder)
     expose_package()
     refuse_network()
@@ -130,19 +131,19 @@ def main() -> None:
         with np.load(folder / ARRAYS, allow_pickle=False) as stored:
             arrays = dict(stored)
         run = _script(request["script"])
-        found, facts = run(request["request"], arrays, lambda name, share: say(step=name, share=float(share)))
+        found, facts = run(request["request"], arrays, lambda name, share: send(step=name, share=float(share)))
         aside = folder / ("." + ANSWER)
         with open(aside, "wb") as file:
             np.savez(file, allow_pickle=False, **found)
         os.replace(aside, folder / ANSWER)
-        say(done=True, facts=dict(facts))
+        send(done=True, facts=dict(facts))
     except BaseException as error:
         traceback.print_exc()
         # A loader may wrap an exhausted memory or a missing module in an error of its own.
-        answers = [told(e) for e in _causes(error)]
-        say(error=next((a for a in answers if a["code"] != "crash"), answers[0]))
+        answers = [error_fields(e) for e in _causes(error)]
+        send(error=next((a for a in answers if a["code"] != "crash"), answers[0]))
     sys.stderr.flush()
-    # Native libraries' threads may hang in the interpreter's end; the answer is on the disk.
+    # Native libraries' threads may block the interpreter's end; the answer is on the disk.
     os._exit(0)
 
 

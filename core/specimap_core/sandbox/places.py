@@ -1,4 +1,4 @@
-"""What a program must be able to read to run at all, without what lies beside it."""
+"""The places that a program must be able to read to run at all, without its neighbours."""
 
 from __future__ import annotations
 
@@ -68,9 +68,10 @@ _GPU_MARKS = ("/dev/nvidiactl", "/dev/dxg")
 
 @dataclass(frozen=True)
 class Reach:
-    """What a process may reach beside its program: ``read`` and ``write`` are files or folders; ``run`` too, with
-    programs in them. ``keep_from``: places that no rule of the program's own may cover, though they lie in its way,
-    such as a database beside an interpreter.
+    """The places that a process may reach apart from its program.
+
+    ``read`` and ``write`` are files or folders, ``run`` too, with programs in them. ``keep_from``: places that no rule
+    of the program's own may cover, though they lie in its way, such as a database next to an interpreter.
     """
 
     read: Sequence[Path] = ()
@@ -107,7 +108,7 @@ def _real(path: Path) -> Path:
 
 
 def _without(place: Path, kept: Sequence[Path]) -> Iterator[Path]:
-    """``place``, or where it holds something to be kept from, all that lies beside that."""
+    """``place``, or where it holds something to be kept from, all other things in it."""
     if place in kept:
         return
     if not any(place in path.parents for path in kept):
@@ -134,9 +135,9 @@ def _module_folders(data: Sequence[Path]) -> Iterator[Path]:
     """Folders of modules, but none that holds other things too: where data lie, or where the program was started."""
     yield from _own_packages()
     main = getattr(sys.modules.get("__main__"), "__file__", None)
-    beside = {_real(Path(os.curdir)), *([_real(Path(main)).parent] if main else [])}
+    left_out = {_real(Path(os.curdir)), *([_real(Path(main)).parent] if main else [])}
     for place in map(Path, filter(None, sys.path)):
-        if _real(place) not in beside and not any(_real(place) in path.parents for path in data):
+        if _real(place) not in left_out and not any(_real(place) in path.parents for path in data):
             yield place
     if _CORE.parent.name in ("site-packages", "dist-packages"):
         yield _CORE.parent

@@ -18,5 +18,5 @@ def main() -> None:
 
 if __name__ == "__main__":
     main()
-    # Native libraries' threads may hang in the interpreter's end.
+    # Native libraries' threads may block the interpreter's end.
     os._exit(0)

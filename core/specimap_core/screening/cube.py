@@ -29,10 +29,10 @@ MOST_BANDS = 1_000_000
 
 
 def judge_part(path: Path, claimed: str, expected_bytes: int | None) -> Verdict:
-    """Tell which part of a cube a file is, and judge a header. Facts: ``part`` (header, data, whole), ``suffix``.
+    """Find which part of a cube a file is, and judge a header. Facts: ``part`` (header, data, whole), ``suffix``.
 
     Args:
-        path: the file; its name says nothing.
+        path: the file; its name is not looked at.
         claimed: the suffix that it came with, lower case: a file that is not what it claims to be is refused.
         expected_bytes: of the data, where the header is known. A file of exactly this size is the data.
     """
@@ -61,7 +61,7 @@ def judge_part(path: Path, claimed: str, expected_bytes: int | None) -> Verdict:
 
 
 def judge_cube(path: Path) -> Verdict:
-    """Open a whole cube (for ENVI the header, its data beside it) and look at some rows.
+    """Open a whole cube (for ENVI the header, with its data in the same folder) and look at some rows.
 
     Facts: rows, cols, bands, dtype, quantity, ``wavelength_nm`` (shortest, longest), warnings.
     """

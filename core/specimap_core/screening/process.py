@@ -1,16 +1,15 @@
-"""The process that looks into files from outside: one JSON line in, one out, until standard input ends.
+"""The process that reads files from outside: one JSON line in, one out, until standard input ends.
 
 ``python -m specimap_core.screening MEMORY_BYTES FILE_BYTES [SANDBOX [PRIVATE…]]``: how much memory the judging of a
 file may take over what the process takes at rest, how large a temporary file may become, the setting of that name, and
 places that are never to be read. Each file is judged in a copy of the process (a fork) of its own, which can read that
 file's folder and write the task's ``scratch``, and ends with its answer: a file that takes a decoder over, makes it
-crash or swallow memory costs that copy, and neither the service nor the next file. Whoever started the process stops it
-when it takes too long.
+crash or use up memory costs that copy, and neither the service nor the next file. The process that started this one
+stops it when it takes too long.
 """
 
 from __future__ import annotations
 
-import ctypes
 import json
 import os
 import resource
@@ -32,12 +31,12 @@ from specimap_core.json_text import json_text
 from specimap_core.photos.decoding import set_up_pillow
 from specimap_core.sandbox import MODES, Confinement, Mode, Reach, program_rules
 from specimap_core.sandbox.landlock import READ, WRITE
+from specimap_core.sandbox.lifetime import die_with
 from specimap_core.sandbox.places import Rule
 from specimap_core.screening.cube import judge_cube, judge_part
 from specimap_core.screening.photo import Others, judge_photo
 from specimap_core.screening.verdict import Verdict
 
-PR_SET_PDEATHSIG = 1
 LARGEST_ANSWER = 256 * 1024
 MOST_OPEN = 128
 DIED: dict[str, Any] = {"died": True}
@@ -65,20 +64,17 @@ def _address_space() -> int:
     return int(pages.read_text().split()[0]) * resource.getpagesize() if pages.exists() else 1 << 30
 
 
-def _end_with_parent() -> None:
-    if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-
-
 class Copy:
     """A copy of this process, for one file. It is made ahead, since copying takes as long as a small photo."""
 
     def __init__(self, memory: int, rules: list[Rule], mode: Mode) -> None:
         task, self._task = os.pipe()
         self._answer, answer = os.pipe()
+        parent = os.getpid()
         self.pid = os.fork()
         if self.pid == 0:
             try:
+                die_with(parent)
                 _judge_one(task, answer, memory, rules, mode)
             except BaseException:
                 traceback.print_exc()
@@ -95,13 +91,13 @@ class Copy:
         """
         with open(self._task, "wb", buffering=0) as pipe:
             pipe.write(line.encode())
-        said = b""
+        received = b""
         with open(self._answer, "rb", buffering=0) as pipe:
-            while b"\n" not in said and len(said) <= LARGEST_ANSWER and (piece := pipe.read(1 << 16)):
-                said += piece
-        # One line and no more: what follows would be taken for the next file's answer.
-        line_said, end, _ = said.partition(b"\n")
-        return line_said + end if end else json_text(DIED).encode() + b"\n"
+            while b"\n" not in received and len(received) <= LARGEST_ANSWER and (piece := pipe.read(1 << 16)):
+                received += piece
+        # One line and no more: the rest would be taken for the next file's answer.
+        answer, end, _ = received.partition(b"\n")
+        return answer + end if end else json_text(DIED).encode() + b"\n"
 
     def end(self) -> None:
         """End it. That takes as long as making it: the answer is sent before."""
@@ -111,7 +107,6 @@ class Copy:
 
 
 def _judge_one(reading: int, writing: int, memory: int, rules: list[Rule], mode: Mode) -> None:
-    _end_with_parent()
     # The pipes to the service are not for this copy: it could read the next tasks, and answer them.
     nothing = os.open(os.devnull, os.O_RDWR)
     for descriptor in (0, 1, 2):
@@ -151,7 +146,7 @@ def main() -> None:
     """Judge files until there are no more."""
     memory, largest_file = int(sys.argv[1]), int(sys.argv[2])
     mode: Mode = sys.argv[3] if len(sys.argv) > 3 and sys.argv[3] in MODES else "best-effort"  # type: ignore[assignment]
-    _end_with_parent()
+    die_with(os.getppid())
     # Libraries that print must not get between the lines.
     out = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)
@@ -167,11 +162,11 @@ def main() -> None:
     out.write(json_text({"ready": True}).encode() + b"\n")
     for line in sys.stdin:
         try:
-            said = copy.judge(line)
-        except BrokenPipeError:  # the system took its memory, say, while it waited: no fault of the file
+            answer = copy.judge(line)
+        except BrokenPipeError:  # the system killed it while it waited, for its memory perhaps: no fault of the file
             copy.end()
             copy = Copy(memory, rules, mode)
-            said = copy.judge(line)
-        out.write(said)
+            answer = copy.judge(line)
+        out.write(answer)
         copy.end()
         copy = Copy(memory, rules, mode)

@@ -1,4 +1,4 @@
-"""What is said about one file: usable or not, why, and what to do."""
+"""The verdict on one file: usable or not, why, and what to do."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Word = Literal["accepted", "doubtful", "refused"]
 class Verdict:
     """``accepted``, ``doubtful`` (usable, but better retaken) or ``refused`` (no job can use it).
 
-    ``code`` is None where there is nothing to say. ``facts`` are JSON values of what was found in the file.
+    ``code`` is None for a file without faults. ``facts`` are JSON values found in the file.
     """
 
     verdict: Word = "accepted"

@@ -1,4 +1,4 @@
-"""What is said of a file that has arrived, beside what its acquisition holds already."""
+"""Judgement of a file that has arrived, given what its acquisition holds already."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ REFERENCES = ("white", "dark")
 
 @dataclass(frozen=True)
 class Arrival:
-    """A file at ``path`` on the local disk, on that of the scratch folder; it is gone afterwards.
+    """A file at ``path``, on the disk of the scratch folder; it is gone afterwards.
 
     ``principal`` where limits of number and quota are still to be checked; ``upload_id`` where it came by one, whose
     row is then finished in the same transaction.
@@ -130,7 +130,7 @@ def _paired(own: CubeJudgement, other: CubeJudgement, pair: dict[str, Any]) -> t
         update = {**words, **facts, "waiting_for": None}
         return _updated(own, update), _updated(other, update)
     blamed = "header" if pair["code"] == CubeHeaderError.code else "data"
-    beside = {
+    waiting = {
         **words,
         "verdict": "doubtful",
         "waiting_for": blamed,
@@ -139,7 +139,7 @@ def _paired(own: CubeJudgement, other: CubeJudgement, pair: dict[str, Any]) -> t
     if own.part == blamed:
         kept = {"verdict": "accepted", "code": None, "reason": "", "advice": "", "waiting_for": blamed}
         return _updated(own, {**words, **facts, "waiting_for": None}), _updated(other, kept)
-    return _updated(own, beside), _updated(other, {**words, **facts, "waiting_for": None})
+    return _updated(own, waiting), _updated(other, {**words, **facts, "waiting_for": None})
 
 
 def _updated(judgement: CubeJudgement, update: dict[str, Any]) -> CubeJudgement:

@@ -1,4 +1,4 @@
-"""What a judging child says, bounded: it has read a stranger's bytes, and may speak for them."""
+"""Checks of a judging child's answer: it has read bytes from outside, and may have been taken over by them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MOST_ITEMS = 2000
 DEEPEST = 4
 LARGEST_NUMBER = 2**53
 WAVELENGTHS_NM = (1.0, 1e7)
-"""Beyond lie X-rays and microwaves: a number there is none of a cube's wavelengths."""
+"""Beyond lie X-rays and microwaves, which no cube records."""
 SUFFIX = re.compile(r"\.[a-z0-9]{1,8}")
 CODE = re.compile(r"[a-z0-9_]{1,64}")
 _CONTROLS = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]+")
@@ -24,13 +24,13 @@ _MODELS: dict[str, type[PhotoJudgement | CubeJudgement]] = {
 }
 
 
-def checked_verdict(kind: str, said: object) -> dict[str, Any]:
+def checked_verdict(kind: str, answer: object) -> dict[str, Any]:
     """The verdict on a ``kind`` of task (photo, part, cube), its texts shortened, its wavelengths plausible or None.
 
     Raises:
-        ValueError: no reader says that.
+        ValueError: no reader gives such an answer.
     """
-    verdict = _bounded(said, 0)
+    verdict = _bounded(answer, 0)
     if not isinstance(verdict, dict):
         raise ValueError("no verdict")
     if kind != "cube" and SUFFIX.fullmatch(str(verdict.get("suffix"))) is None:
@@ -39,7 +39,7 @@ def checked_verdict(kind: str, said: object) -> dict[str, Any]:
         raise ValueError("no code")
     if "wavelength_nm" in verdict:
         verdict["wavelength_nm"] = _wavelengths(verdict["wavelength_nm"])
-    # Its error is a ValueError.
+    # pydantic's error is a ValueError.
     _MODELS[kind].model_validate({"part": "whole", **verdict} if kind == "cube" else verdict)
     return verdict
 

@@ -31,7 +31,7 @@ from specimap_core.sandbox.environment import bare_environment
 from specimap_core.sandbox.process import child_environment
 from specimap_workers.plan import plan_of
 from specimap_workers.stage_process import StageProcess
-from specimap_workers.workspaces import Cells
+from specimap_workers.workspaces import Workspaces
 from tests.support.backend_files import bring_da3, bring_mast3r, no_variables
 from tests.support.scenes import OnDisk
 from tests.support.worker_scene import shop
@@ -95,8 +95,8 @@ def test_a_stages_process_sees_the_variables_of_backends_and_no_secret(tmp_path:
         del stage, share
 
     async def run() -> None:
-        cells = Cells(tmp_path, "test", "off", ())
-        process = await StageProcess.start([sys.executable, "-c", TELLS], cells)
+        workspaces = Workspaces(tmp_path, "test", "off", ())
+        process = await StageProcess.start([sys.executable, "-c", TELLS], workspaces)
         await process.run({"stage": "reconstruct", "out": str(tmp_path)}, heard, 30)
 
     asyncio.run(run())

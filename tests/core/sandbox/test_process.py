@@ -28,7 +28,7 @@ SOON = 5.0
 
 
 def ended(pid: int) -> bool:
-    """Whether a process is gone within a while; a zombie that nobody has fetched counts as gone."""
+    """Whether a process is gone within a while; a zombie that nobody has collected counts as gone."""
     end = time.monotonic() + SOON
     while time.monotonic() < end:
         stat = Path(f"/proc/{pid}/stat")
@@ -159,7 +159,7 @@ def test_an_exception_keeps_its_words_its_place_and_the_last_lines(tmp_path: Pat
         "os.kill(os.getpid(), 9)",
     ],
 )
-def test_exhausted_memory_is_told_as_such(tmp_path: Path, body: str) -> None:
+def test_exhausted_memory_is_reported_as_such(tmp_path: Path, body: str) -> None:
     with pytest.raises(BackendFailedError, match="out of memory") as caught:
         ask(tmp_path, body)
     assert caught.value.details["reason"] == "out_of_memory"
@@ -207,7 +207,7 @@ def test_cancelling_kills_the_child_and_what_it_started(tmp_path: Path) -> None:
     assert all(ended(pid) for pid in pids)
 
 
-def test_cancelling_is_heard_while_the_child_is_silent(tmp_path: Path) -> None:
+def test_cancelling_takes_effect_while_the_child_is_silent(tmp_path: Path) -> None:
     started = time.monotonic()
 
     def progress(share: float) -> None:

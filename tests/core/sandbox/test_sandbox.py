@@ -26,7 +26,7 @@ from specimap_infra.confinement import check_confinement
 from specimap_infra.settings import load_settings
 from specimap_service.acquisitions.judge import Judge
 from specimap_workers.stage_process import Processes
-from specimap_workers.workspaces import Cells, is_plain
+from specimap_workers.workspaces import Workspaces, is_plain
 from tests.support import escapes
 
 pytestmark = pytest.mark.skipif(not protection().whole, reason="this kernel does not confine")
@@ -39,8 +39,8 @@ from specimap_core.screening import process as child
 from specimap_core.screening.verdict import Verdict
 
 def escape(task):
-    told = json.loads(Path(task["path"]).read_text())
-    found = tried({{**told, "own": task["scratch"], "parent": os.getppid()}})
+    targets = json.loads(Path(task["path"]).read_text())
+    found = tried({{**targets, "own": task["scratch"], "parent": os.getppid()}})
     return Verdict(facts={{"found": [f"{{name}}: {{how}}" for name, how in found.items()]}})
 
 child.TASKS["cube"] = escape
@@ -51,9 +51,9 @@ import json
 from specimap_workers import stage_main
 
 def escape(spec, out):
-    found = tried({{**json.loads((Path(spec["inputs"]["photos"]) / "told").read_text()), "own": spec["out"]}})
+    found = tried({{**json.loads((Path(spec["inputs"]["photos"]) / "targets").read_text()), "own": spec["out"]}})
     (Path(spec["out"]) / "found").write_text(json.dumps(found))
-    stage_main._say(out, event="done", seconds=0)
+    stage_main._send(out, event="done", seconds=0)
 
 stage_main._run = escape
 stage_main.main()
@@ -65,8 +65,8 @@ print(json.dumps(tried(json.loads(sys.argv[1]))))
 
 
 @pytest.fixture
-def told(tmp_path: Path) -> Iterator[dict[str, Any]]:
-    """What there is to get at, as of :func:`escapes.ways`, but ``own`` and ``link``."""
+def targets(tmp_path: Path) -> Iterator[dict[str, Any]]:
+    """The things to get at, as of :func:`escapes.ways`, but ``own`` and ``link``."""
     elsewhere = tmp_path / "data" / "storage"
     elsewhere.mkdir(parents=True)
     for name in ("secret", "spare", "other"):
@@ -105,28 +105,28 @@ def told(tmp_path: Path) -> Iterator[dict[str, Any]]:
         escapes.LIBRARY.msgctl(queue, 0, None)
 
 
-def linked(folder: Path, told: dict[str, Any]) -> Path:
+def linked(folder: Path, targets: dict[str, Any]) -> Path:
     link = folder / "link"
-    link.symlink_to(told["secret"])
+    link.symlink_to(targets["secret"])
     plain = folder / "plain"
     plain.write_text("given")
     plain.chmod(0o600)
     return link
 
 
-def untouched(told: dict[str, Any]) -> None:
-    elsewhere = Path(told["elsewhere"])
+def untouched(targets: dict[str, Any]) -> None:
+    elsewhere = Path(targets["elsewhere"])
     assert {p.name for p in elsewhere.iterdir()} == {"secret", "spare", "other"}
-    assert Path(told["secret"]).read_text() == "secret"
-    assert Path(told["secret"]).stat().st_mode & 0o777 == 0o600
+    assert Path(targets["secret"]).read_text() == "secret"
+    assert Path(targets["secret"]).stat().st_mode & 0o777 == 0o600
 
 
-def in_judging(told: dict[str, Any], folder: Path, mode: Mode) -> dict[str, str]:
+def in_judging(targets: dict[str, Any], folder: Path, mode: Mode) -> dict[str, str]:
     settings = load_settings(data_dir=folder.parent / "data", sandbox=mode)
     judge = Judge(settings, os.environ, (sys.executable, "-c", JUDGING))
     task = folder / "task"
     task.mkdir(parents=True)
-    (task / "cube").write_text(json.dumps({**told, "link": str(linked(task, told))}))
+    (task / "cube").write_text(json.dumps({**targets, "link": str(linked(task, targets))}))
     try:
         verdict = judge.cube(task / "cube")
     finally:
@@ -134,23 +134,23 @@ def in_judging(told: dict[str, Any], folder: Path, mode: Mode) -> dict[str, str]
     return dict(line.split(": ", 1) for line in verdict["found"])
 
 
-def in_stage(told: dict[str, Any], folder: Path, mode: Mode) -> dict[str, str]:
+def in_stage(targets: dict[str, Any], folder: Path, mode: Mode) -> dict[str, str]:
     inputs, out = folder / "inputs", folder / "out"
     (inputs / "photos").mkdir(parents=True)
     out.mkdir()
-    cells = Cells(folder / "work", "test", mode, (folder.parent / "data",))
+    workspaces = Workspaces(folder / "work", "test", mode, (folder.parent / "data",))
 
-    async def heard(stage: str, share: float) -> None:
+    async def ignore(stage: str, share: float) -> None:
         del stage, share
 
     async def run() -> None:
-        processes = Processes(cells, (sys.executable, "-c", STAGE))
+        processes = Processes(workspaces, (sys.executable, "-c", STAGE))
         process = await processes.take()
-        with process.cell.holding(inputs, out) as (given, own):
-            link = linked(given / "photos", told)
-            (given / "photos" / "told").write_text(json.dumps({**told, "link": str(link)}))
+        with process.workspace.holding(inputs, out) as (given, own):
+            link = linked(given / "photos", targets)
+            (given / "photos" / "targets").write_text(json.dumps({**targets, "link": str(link)}))
             spec = {"stage": "reconstruct", "inputs": {"photos": str(given / "photos")}, "out": str(own)}
-            await process.run(spec, heard, 120)
+            await process.run(spec, ignore, 120)
         await process.end()
         await processes.close()
 
@@ -159,13 +159,15 @@ def in_stage(told: dict[str, Any], folder: Path, mode: Mode) -> dict[str, str]:
     return dict(json.loads((out / "found").read_text()))
 
 
-def in_export(told: dict[str, Any], folder: Path, mode: Mode) -> dict[str, str]:
-    cells = Cells(folder / "work", "test", mode, (folder.parent / "data",))
-    cell = cells.new()
-    said = json.dumps({**told, "own": str(cell.own), "link": str(linked(cell.given, told))})
-    command = cells.confined([sys.executable, "-c", EXPORT, said], cell, backends=False)
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=cells.environment(cell), check=True)
-    cell.remove()
+def in_export(targets: dict[str, Any], folder: Path, mode: Mode) -> dict[str, str]:
+    workspaces = Workspaces(folder / "work", "test", mode, (folder.parent / "data",))
+    workspace = workspaces.new()
+    described = json.dumps({**targets, "own": str(workspace.own), "link": str(linked(workspace.given, targets))})
+    command = workspaces.confined([sys.executable, "-c", EXPORT, described], workspace, backends=False)
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=120, env=workspaces.environment(workspace), check=True
+    )
+    workspace.remove()
     return dict(json.loads(done.stdout))
 
 
@@ -173,19 +175,19 @@ KINDS = {"judging": in_judging, "stage": in_stage, "export": in_export}
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_no_way_leads_out(kind: str, told: dict[str, Any], tmp_path: Path) -> None:
-    found = KINDS[kind](told, tmp_path / "own", "require")
-    assert len(found) == len(escapes.ways({**told, "own": ".", "link": "link"}))
+def test_no_way_leads_out(kind: str, targets: dict[str, Any], tmp_path: Path) -> None:
+    found = KINDS[kind](targets, tmp_path / "own", "require")
+    assert len(found) == len(escapes.ways({**targets, "own": ".", "link": "link"}))
     assert {name: how for name, how in found.items() if how == "out"} == {}
     # What stops them is the confinement, not a mistake of the test.
     mistakes = ("TypeError", "NameError", "AttributeError", "FileNotFoundError")
     assert not [how for how in found.values() if how.startswith(mistakes)]
-    untouched(told)
+    untouched(targets)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_they_lead_out_where_nothing_is_confined(kind: str, told: dict[str, Any], tmp_path: Path) -> None:
-    found = KINDS[kind](told, tmp_path / "own", "off")
+def test_they_lead_out_where_nothing_is_confined(kind: str, targets: dict[str, Any], tmp_path: Path) -> None:
+    found = KINDS[kind](targets, tmp_path / "own", "off")
     # These depend on rights of the user and on the kernel, with or without us.
     moody = {
         "use io_uring",
@@ -219,16 +221,18 @@ def test_no_capability_is_left(tmp_path: Path) -> None:
         assert done.stdout.split() == ["0" * 16] * 5 + ["1"]
 
 
-def test_a_cell_gives_the_inputs_to_read_alone(tmp_path: Path) -> None:
-    cells = Cells(tmp_path / "work", "test", "require", (tmp_path,))
-    cell = cells.new()
-    (cell.given / "photo").write_text("original")
+def test_a_workspace_gives_the_inputs_to_read_alone(tmp_path: Path) -> None:
+    workspaces = Workspaces(tmp_path / "work", "test", "require", (tmp_path,))
+    workspace = workspaces.new()
+    (workspace.given / "photo").write_text("original")
     program = "import sys; print(open(sys.argv[1]).read()); open(sys.argv[1], 'a').write('changed')"
-    command = cells.confined([sys.executable, "-c", program, str(cell.given / "photo")], cell, backends=False)
+    command = workspaces.confined(
+        [sys.executable, "-c", program, str(workspace.given / "photo")], workspace, backends=False
+    )
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.stdout == "original\n"
     assert "PermissionError" in done.stderr
-    assert (cell.given / "photo").read_text() == "original"
+    assert (workspace.given / "photo").read_text() == "original"
 
 
 def test_stages_reach_what_the_environment_names_for_backends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -243,15 +247,15 @@ def test_stages_reach_what_the_environment_names_for_backends(tmp_path: Path, mo
     monkeypatch.setenv("SPECIMAP_DA3_WEIGHTS", str(weights))
     monkeypatch.setenv("SPECIMAP_MAST3R_HOME", str(home))
     monkeypatch.setenv("SPECIMAP_MAST3R_CACHE", str(cache))
-    cells = Cells(tmp_path / "work", "test", "require", (), backends_from(os.environ))
-    cell = cells.new()
+    workspaces = Workspaces(tmp_path / "work", "test", "require", (), backends_from(os.environ))
+    workspace = workspaces.new()
     program = (
         "import sys; print(open(sys.argv[1]).read(), open(sys.argv[2]).read());"
         "open(sys.argv[3], 'w').close(); open(sys.argv[2], 'w')"
     )
     places = [str(weights / "model.safetensors"), str(home / "code.py"), str(cache / "new")]
     for backends in (True, False):
-        command = cells.confined([sys.executable, "-c", program, *places], cell, backends=backends)
+        command = workspaces.confined([sys.executable, "-c", program, *places], workspace, backends=backends)
         done = subprocess.run(command, capture_output=True, text=True, timeout=60)
         assert "PermissionError" in done.stderr
         assert done.stdout == ("numbers code\n" if backends else "")
@@ -294,20 +298,20 @@ def test_other_processes_stay_closed_where_proc_is_open(tmp_path: Path) -> None:
 
 
 def test_no_rule_covers_a_private_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    beside = tmp_path / "modules"
-    (beside / "data").mkdir(parents=True)
-    (beside / "module.py").write_text("")
+    modules = tmp_path / "modules"
+    (modules / "data").mkdir(parents=True)
+    (modules / "module.py").write_text("")
     (tmp_path / "plain").mkdir()
-    monkeypatch.syspath_prepend(str(beside))
+    monkeypatch.syspath_prepend(str(modules))
     monkeypatch.syspath_prepend(str(tmp_path / "plain"))
-    named = [place for place, _ in program_rules(Reach(keep_from=[beside / "data"]))]
+    named = [place for place, _ in program_rules(Reach(keep_from=[modules / "data"]))]
     assert str(tmp_path / "plain") in named
-    assert not [place for place in named if Path(place) == beside or beside in Path(place).parents]
-    # An interpreter beside the data is needed all the same: what lies beside the data is named, and not the data.
-    monkeypatch.setattr(sys, "prefix", str(beside))
-    named = [place for place, _ in program_rules(Reach(keep_from=[beside / "data"]))]
-    assert str(beside / "module.py") in named
-    assert not {str(beside), str(beside / "data")} & set(named)
+    assert not [place for place in named if Path(place) == modules or modules in Path(place).parents]
+    # An interpreter next to the data is needed all the same: its files are named, and the data are not.
+    monkeypatch.setattr(sys, "prefix", str(modules))
+    named = [place for place, _ in program_rules(Reach(keep_from=[modules / "data"]))]
+    assert str(modules / "module.py") in named
+    assert not {str(modules), str(modules / "data")} & set(named)
     monkeypatch.chdir(tmp_path / "plain")
     assert str(tmp_path / "plain") not in [place for place, _ in program_rules(Reach())]
 
@@ -356,25 +360,25 @@ def test_without_landlock_what_there_is_holds(version: int, tmp_path: Path) -> N
 def test_a_kernel_without_it_is_warned_of_or_refused(
     landlock: int, seccomp: bool, missing: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    said: list[str] = []
+    warned: list[str] = []
 
     class Log:
         def warning(self, text: str, **_: object) -> None:
-            said.append(text)
+            warned.append(text)
 
     monkeypatch.setattr(confinement, "protection", lambda: Protection(landlock, seccomp))
     monkeypatch.setattr(confinement, "logger", Log)
     with pytest.raises(SettingsError, match=missing) as caught:
         check_confinement(load_settings(data_dir=tmp_path, sandbox="require"))
     assert caught.value.details["setting"] == "sandbox"
-    assert not said
+    assert not warned
     check_confinement(load_settings(data_dir=tmp_path))
-    assert missing in said.pop()
+    assert missing in warned.pop()
     check_confinement(load_settings(data_dir=tmp_path, sandbox="off"))
-    assert "off" in said.pop()
+    assert "off" in warned.pop()
     monkeypatch.setattr(confinement, "protection", lambda: Protection(7, True))
     check_confinement(load_settings(data_dir=tmp_path, sandbox="require"))
-    assert not said
+    assert not warned
 
 
 @pytest.mark.parametrize("kind", ["link", "pipe"])
