@@ -149,7 +149,11 @@ def test_lock_pins_what_the_project_asks_for() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     wanted = [
         *project["dependencies"],
-        *(r for extra in ("infra", "service", "pipeline", "dev") for r in project["optional-dependencies"][extra]),
+        *(
+            requirement
+            for extra in ("infra", "screening", "service", "pipeline", "dev")
+            for requirement in project["optional-dependencies"][extra]
+        ),
     ]
     lines = [line for line in (ROOT / "requirements.lock").read_text("utf-8").splitlines() if line[:1] not in ("", "#")]
     pins = {canonicalize_name(pin.name): pin for pin in map(Requirement, lines)}
@@ -161,6 +165,18 @@ def test_lock_pins_what_the_project_asks_for() -> None:
         (pin,) = pins[canonicalize_name(requirement.name)].specifier
         assert pin.operator == "=="
         assert requirement.specifier.contains(pin.version), text
+
+
+def test_each_dependency_is_listed_once() -> None:
+    import tomllib
+
+    from packaging.requirements import Requirement
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    lists = [project["dependencies"], *project["optional-dependencies"].values()]
+    names = [Requirement(text).name for requirements in lists for text in requirements]
+    own = [name for name in names if name != "specimap"]
+    assert sorted(own) == sorted(set(own))
 
 
 def test_sample_is_small_and_its_truth_fits_its_cube() -> None:

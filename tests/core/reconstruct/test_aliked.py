@@ -139,8 +139,9 @@ def test_missing_weights_are_refused_not_fetched(monkeypatch: pytest.MonkeyPatch
 
 def test_torch_stays_out_unless_aliked_is_asked_for() -> None:
     code = (
-        "import sys; from specimap_core.reconstruct import posing, features; features.feature_kind('sift', 1); "
-        "features.check_features('auto'); print('torch' in sys.modules)"
+        "import sys; from specimap_core.reconstruct import poses; "
+        "from specimap_core.reconstruct.features import choice; "
+        "choice.feature_kind('sift', 1); choice.check_features('auto'); print('torch' in sys.modules)"
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
     assert said.stdout.strip() == "False"

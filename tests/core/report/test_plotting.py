@@ -46,8 +46,8 @@ def test_sizes_in_pixels() -> None:
 
 def test_nothing_needs_a_screen_or_says_anything() -> None:
     code = (
-        "import sys; from specimap_core import plotting as p; f = p.figure(); p.styled(f.add_subplot()); p.png(f);"
-        "print('matplotlib.pyplot' in sys.modules)"
+        "import sys; from specimap_core.report import plotting as p; f = p.figure(); p.styled(f.add_subplot()); "
+        "p.png(f); print('matplotlib.pyplot' in sys.modules)"
     )
     told = subprocess.run(
         [sys.executable, "-W", "error", "-c", code],
