@@ -17,9 +17,9 @@ TEST_PROCESSES ?= 3
 help:
 	@echo "make setup   install the pinned versions into $(VENV)"
 	@echo "make learned add PyTorch and the learned features"
-	@echo "make demo    set up, then run the sample through the service; results in $(DEMO_OUT)"
+	@echo "make demo    set up, then run samples/ through a service of its own into $(DEMO_OUT)"
 	@echo "make test    set up, with the learned features, then run the tests"
-	@echo "make lint    check formatting, ruff and mypy"
+	@echo "make lint    formatting (ruff format .), ruff and mypy"
 	@echo "make bench   measure time, memory and accuracy of a run"
 	@echo "make bench-service   measure the service, compared with nginx where it is installed"
 	@echo "make check-images    build and run the images of docker/ without Docker (needs root and the network)"

@@ -79,6 +79,14 @@ def test_files_and_modules_that_a_page_names_exist(page: Path) -> None:
         assert find_spec(module) is not None, f"{page_name(page)} names the module {module}"
 
 
+def test_names_in_the_guide_for_contributors_are_where_it_says() -> None:
+    text = " ".join(CONTRIBUTING.read_text("utf-8").split())
+    found = re.findall(r"`(\w+)`[^`]{0,20}\bin `([\w/]+\.py)`", text)
+    assert len(found) > 8
+    for name, path in found:
+        assert re.search(rf"\b{name}\b", (ROOT / path).read_text("utf-8")), f"{path} has no {name}"
+
+
 def commands() -> dict[str, set[str]]:
     """Options of each command, by its words: `keys create` among them."""
     root = typer.main.get_command(app)
