@@ -62,9 +62,9 @@ def sample_sentences(figures: dict[str, Any]) -> str:
     """The error on the sample, by both registrations, for the README."""
     best, flat = figures[SAMPLE]["camera"], figures[SAMPLE]["homography"]
     return (
-        f"On the synthetic sample the median position error is {best['median_mm']:.3f} mm, and 95 % of the points lie "
-        f"within {best['p95_mm']:.2f} mm of the truth. The published registration (`--method homography`), on the same "
-        f"photos, gives {flat['median_mm']:.2f} and {flat['p95_mm']:.2f} mm."
+        f"On the synthetic sample the median position error is {best['median_mm']:.3f} mm, and 95 % of the specimen's "
+        f"points lie within {best['p95_mm']:.2f} mm of the truth. The published registration (`--method homography`), "
+        f"on the same photos, gives {flat['median_mm']:.2f} and {flat['p95_mm']:.2f} mm."
     )
 
 
