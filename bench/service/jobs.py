@@ -53,7 +53,7 @@ def sheet_jobs(figures: dict[str, Any]) -> list[Sheet]:
     """Seconds, medians and the worst."""
     sheet = Sheet(
         "Jobs of the sample (24 photos, cube 464 x 432 x 16) through the service, one at a time, median s",
-        ("what", "runs", "submitted to heard", "waited", "stages", "beside them", "worst", "wanted", "met"),
+        ("job", "runs", "submission to answer", "waited", "stages", "overhead", "worst overhead", "wanted", "met"),
     )
     for kind, runs in figures["runs"].items():
         worst = max(run["overhead_s"] for run in runs)
@@ -70,8 +70,8 @@ def sheet_jobs(figures: dict[str, Any]) -> list[Sheet]:
         )
     uploaded = _median(figures["runs"]["job"], "upload_s")
     sheet.notes.append(
-        "Waited: from submission to the worker's start. Beside them: from there to the end, less the stages that ran. "
-        f"The 26 files of one acquisition go up, each hashed and judged, in {uploaded:.1f} s."
+        "Waited: from submission to the worker's start. Overhead: from there to the end, less the stages that ran. "
+        f"The 26 files of one acquisition are uploaded, hashed and judged in {uploaded:.1f} s."
     )
     return [sheet]
 

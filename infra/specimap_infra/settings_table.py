@@ -1,4 +1,4 @@
-"""``python -m specimap_infra.settings_table``: the tables of docs/settings.md, made from the settings themselves."""
+"""``python -m specimap_infra.settings_table``: print the tables of docs/settings.md, made from the settings."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from specimap_infra.settings import GIB, MIB, ServiceSettings
 DATA_DIR = "`$XDG_DATA_HOME/specimap`, else `~/.local/share/specimap`"
 HEADER = "| variable | default | takes | meaning |\n|---|---|---|---|"
 OF_BACKENDS = (
-    "Of backends and devices, for `specimap worker`, `serve` and `run` alike; from the environment alone, not from the "
-    "file.\nDefaults and what they take: [backends.md](backends.md)."
+    "Backends and devices, for `specimap worker`, `serve` and `run`. These come from the environment only, never from "
+    "the file.\n[backends.md](backends.md) gives their defaults and their possible values."
 )
 
 
 def settings_table() -> str:
-    """All settings as a Markdown table, one a line, in the order of the class."""
+    """All settings as a Markdown table, one per line, in the order of the class."""
     return "\n".join([HEADER, *(_row(name, field) for name, field in ServiceSettings.model_fields.items())])
 
 
 def backends_table() -> str:
-    """The variables of backends and devices as a Markdown table, one a line."""
+    """The variables of backends and devices as a Markdown table, one per line."""
     rows = (f"| `{name}` | {meaning} |" for name, meaning in BACKEND_VARIABLES.items())
     return "\n".join(["| variable | meaning |\n|---|---|", *rows])
 
@@ -43,7 +43,7 @@ def _row(name: str, field: FieldInfo) -> str:
 
 def _default(name: str, field: FieldInfo) -> str:
     if name == "data_dir":
-        return DATA_DIR  # the one default that depends on who asks
+        return DATA_DIR  # the one default that differs from user to user
     value = field.get_default(call_default_factory=True, validated_data={})
     if value is PydanticUndefined:
         raise TypeError(f"{name} has no default")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import threading
 import types
 from collections.abc import Callable
 from importlib.metadata import version
+from pathlib import Path
 
 import pytest
 
@@ -27,8 +29,9 @@ from bench.program import PARTS
 from bench.step_bounds import BOUNDS, Recorded, Recorder, on_threads
 from bench.steps import END, ORDER, REST, START, imports_in, sheet_steps, steps_of
 from bench.synthetic import COLS, ROWS
-from bench.tables import OF_RUNS, ROOT, run_tables
+from bench.tables import ACCURACY, MARKS, OF_RUNS, run_tables, sample_sentences
 from bench.tracing import TARGETS, Spent, Target, owner_of, tracing
+from specimap_validation import validation
 from specimap_validation.page_marks import check_marks
 
 
@@ -242,10 +245,23 @@ def test_the_machine_names_optional_packages_only_where_they_are() -> None:
     assert available_bytes() > 0
 
 
-def test_each_table_of_the_page_comes_from_a_part_and_has_its_place() -> None:
+@pytest.mark.parametrize(
+    ("page", "mark"),
+    [*((page, mark) for page, marks in MARKS.items() for mark in marks), (ACCURACY, validation.MARK)],
+    ids=lambda part: getattr(part, "name", part),
+)
+def test_each_generated_text_has_its_place(page: Path, mark: str) -> None:
+    assert f"<!-- {mark} -->" in check_marks(page, mark)
+
+
+def test_each_table_of_a_run_comes_from_a_part() -> None:
     assert set(OF_RUNS) < set(PARTS)
-    for part in OF_RUNS:
-        assert f"<!-- {part} -->" in check_marks(ROOT / "docs" / "performance.md", part)
+
+
+def test_the_readme_states_the_errors_of_both_registrations_on_the_sample() -> None:
+    case = {"camera": {"median_mm": 0.0478, "p95_mm": 0.284}, "homography": {"median_mm": 0.541, "p95_mm": 1.899}}
+    sentences = sample_sentences({"sample": case})
+    assert re.findall(r"\d\.\d+", sentences) == ["0.048", "0.28", "0.54", "1.90"]
 
 
 def test_a_table_of_the_page_says_what_it_was_measured_on() -> None:

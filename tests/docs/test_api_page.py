@@ -1,4 +1,4 @@
-"""docs/api.md against a running service: every command and program on the page is run, in the page's order."""
+"""docs/api.md against a running service: run every command and program of the page, in its order."""
 
 from __future__ import annotations
 
@@ -66,10 +66,10 @@ def keys(reader: Reader) -> None:
 
 
 def errors(reader: Reader) -> None:
-    (told,) = documents(reader.sh("Errors", status=22))
+    (answer,) = documents(reader.sh("Errors", status=22))
     shown = json.loads(reader.next("Errors", "json"))
-    assert {**told, "correlation_id": ""} == {**shown, "correlation_id": ""}
-    assert len(told["correlation_id"]) == len(shown["correlation_id"])
+    assert {**answer, "correlation_id": ""} == {**shown, "correlation_id": ""}
+    assert len(answer["correlation_id"]) == len(shown["correlation_id"])
 
 
 def uploads(reader: Reader) -> None:
@@ -132,12 +132,12 @@ def jobs_and_events(reader: Reader) -> None:
         jobs.log(session, again["id"], EXECUTOR, "info", "Stage adjust is there.", stage="adjust")
         jobs.finish(session, again["id"], EXECUTOR, "succeeded")
     reader.variables["JOB"] = again["id"]
-    told, shown = events(reader.sh("Events")), events(reader.next("Events", "text"))
-    assert [seq for seq, _, _ in told] == [1, 2, 3, 4, 5]
-    assert [(seq, kind, data.keys()) for seq, kind, data in told[1:]] == [
+    sent_events, shown = events(reader.sh("Events")), events(reader.next("Events", "text"))
+    assert [seq for seq, _, _ in sent_events] == [1, 2, 3, 4, 5]
+    assert [(seq, kind, data.keys()) for seq, kind, data in sent_events[1:]] == [
         (seq, kind, data.keys()) for seq, kind, data in shown
     ]
-    assert events(reader.sh("Events")) == told[3:]
+    assert events(reader.sh("Events")) == sent_events[3:]
     after = reader.client.get(f"/v1/jobs/{again['id']}/events", headers={"Last-Event-ID": "5"})
     assert after.status_code == 204
 
@@ -162,14 +162,14 @@ def receiving(handler: type[BaseHTTPRequestHandler]) -> Iterator[str]:
 
 def webhook(reader: Reader) -> None:
     program = reader.python("Webhooks")
-    told: list[tuple[str | None, ...]] = []
-    program["print"] = lambda *words: told.append(words)
+    printed: list[tuple[str | None, ...]] = []
+    program["print"] = lambda *words: printed.append(words)
     with receiving(program["Hook"]) as url, webhook_client() as sender:
         job = {"acquisition_id": reader.variables["ACQ"], "webhook": {"url": url, "secret": SECRET}}
         job_id = reader.client.post("/v1/jobs", json=job).json()["id"]
         reader.client.post(f"/v1/jobs/{job_id}/cancel")
         assert deliver_due(reader.service.database, reader.service.settings, sender) == 1
-        assert told == [("job.cancelled", job_id, None)]
+        assert printed == [("job.cancelled", job_id, None)]
 
         def post(signature: str, delivery: str) -> int:
             headers = {b"X-Specimap-Signature": signature.encode("latin-1"), b"X-Specimap-Delivery": delivery.encode()}
@@ -178,10 +178,10 @@ def webhook(reader: Reader) -> None:
         body, now = json.dumps({"event": "job.failed", "job": {"id": "job_1", "cloud_id": None}}).encode(), time.time()
         good = sign(SECRET, body, int(now))
         assert [post(good, "dlv_1"), post(good, "dlv_1")] == [204, 204]
-        assert told[1:] == [("job.failed", "job_1", None)]
+        assert printed[1:] == [("job.failed", "job_1", None)]
         forged = (sign("another secret of 16", body, int(now)), sign(SECRET, body, int(now) - 1000), "", "t=,v1=ü")
         assert [post(signature, "dlv_2") for signature in forged] == [400] * 4
-        assert len(told) == 2
+        assert len(printed) == 2
 
 
 def results(reader: Reader) -> None:
@@ -253,9 +253,9 @@ def lists_and_ranges(reader: Reader) -> None:
     first, second = documents(reader.sh("Lists, ranges, limits"))
     assert [page["items"][0]["id"] for page in (first, second)] == listed[:2]
     assert first["next"] == listed[0]
-    told = reader.sh("Lists, ranges, limits")
+    answer = reader.sh("Lists, ranges, limits")
     mesh = (reader.result.local / "mesh.ply").read_bytes()
-    assert header(told, "content-range") == f"bytes 0-99/{len(mesh)}"
+    assert header(answer, "content-range") == f"bytes 0-99/{len(mesh)}"
     assert (reader.folder / "head.ply").read_bytes() == mesh[:100]
 
 

@@ -1,4 +1,4 @@
-"""The example of the guide: what it labels is as right as anything can be."""
+"""The example and the guide for classifiers run, and the example labels as well as any classifier can."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_readme_names_what_there_is() -> None:
 
 
 def blocks(page: str) -> list[str]:
-    """The Python of a page."""
+    """The Python programs of a page."""
     return re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
 
 

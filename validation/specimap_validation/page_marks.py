@@ -1,4 +1,4 @@
-"""Text between marks of a page, which programs keep up to date."""
+"""Text between marks of a page, kept up to date by programs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from specimap_core.errors import SettingsError
 
 
 def put(page: Path, mark: str, text: str) -> None:
-    """Replace what stands between ``<!-- mark -->`` and ``<!-- /mark -->`` of a page.
+    """Replace the text between ``<!-- mark -->`` and ``<!-- /mark -->`` of a page.
 
     Raises:
         SettingsError: see :func:`check_marks`.
@@ -20,10 +20,10 @@ def put(page: Path, mark: str, text: str) -> None:
 
 
 def check_marks(page: Path, mark: str) -> str:
-    """The page's text, if it has one such place.
+    """Return the text of a page that has exactly one such place.
 
     Raises:
-        SettingsError: the page is not there, or has no such place, or several.
+        SettingsError: the page does not exist, or has no such place, or several.
     """
     if not page.is_file():
         raise SettingsError(f"There is no page {page}.", advice="Name a page of markdown.", setting="page")

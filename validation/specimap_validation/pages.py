@@ -1,4 +1,4 @@
-"""A study or a validation as files to be read: a page of HTML that needs nothing else, and its figures."""
+"""A study or a validation as files for people: one self-contained page of HTML, and its figures."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Drawn:
 
 
 def check_drawing() -> None:
-    """Refuse before hours of work rather than after.
+    """Refuse a missing package before hours of work rather than after.
 
     Raises:
         BackendUnavailableError: a package that draws figures or pages is missing.
@@ -47,11 +47,11 @@ def publish_study(study: Study, out: Path) -> list[Path]:
         f"{study.acquisition}: {study.photos} photos, {study.method} registration, {study.adjustment} adjustment, "
         f"Specimap {study.specimap_version}. Each run reconstructs from a random share of the photos; all photos are "
         "used once.",
-        "Corner errors are what a run can say of itself. The true error, known where the acquisition's geometry is, is "
-        "the distance between where a spectrum of the specimen was put and where it was measured.",
+        "A run can state its corner errors itself. The true error needs an acquisition of known geometry: it is the "
+        "distance between the place where a spectrum of the specimen was put and the place where it was measured.",
         f"{published.REFERENCE} state a 2D corner error of {published.CORNER_2D_WORDS} mm and a 3D corner error of "
         f"{published.CORNER_3D_WORDS} mm with all views, and more than {published.DROPPED_3D_MM:g} mm as soon as a "
-        "tenth of the views is missing; their specimens are other ones.",
+        "tenth of the views is missing; their specimens are different ones.",
     ]
     figures = {
         "subsampling_2d": ("2D corner error of every run; the line joins the medians.", lambda: study_2d(study)),
@@ -68,7 +68,8 @@ def publish_validation(validation: Validation, out: Path) -> list[Path]:
         in_words(validation),
         "The 2D and 3D corner errors are the published ones: cube corners against the run's own reconstruction. "
         "The error of a left-out marker comes from a registration that did not know it. The true error is the distance "
-        "between where a spectrum of the specimen was put and where it was measured, corners fitted without scale.",
+        "between the place where a spectrum of the specimen was put and the place where it was measured, with the "
+        "corners fitted without scale.",
     ]
     figures = {
         "validation_error": ("True error of every run.", lambda: validation_error(validation)),
