@@ -13,8 +13,8 @@ import numpy as np
 from specimap_core.cube.model import readable_dtype
 from specimap_core.cube.printable import shown
 from specimap_core.cube.spectral_units import read_unit
-from specimap_core.cube.wavelengths import Warnings
 from specimap_core.errors import CubeFormatError, CubeHeaderError
+from specimap_core.notices import Notice, Notices
 
 _CUBE_NAMES = ("cube", "reflectance", "hypercube", "spectra", "data", "image", "img", "hsi", "capture")
 _REFLECTANCE = re.compile(r"refl|rfl|albedo", re.IGNORECASE)
@@ -67,7 +67,7 @@ class Variable:
         return f"'{shown(self.name)}' ({', '.join(sides[:_SHOWN])}{', ...' if len(sides) > _SHOWN else ''})"
 
 
-def choose_cube(path: Path, variables: Sequence[Variable], wanted: str | None = None) -> tuple[Variable, Warnings]:
+def choose_cube(path: Path, variables: Sequence[Variable], wanted: str | None = None) -> tuple[Variable, Notices]:
     """The variable with three axes, and a warning that names it where others could have been meant.
 
     Of several the one whose name says reflectance comes first, then the one whose name says cube, then the only one
@@ -91,7 +91,7 @@ def choose_cube(path: Path, variables: Sequence[Variable], wanted: str | None = 
     beside = [v.described() for v in found if v is not chosen]
     others = ", ".join(beside[:_SHOWN]) + (", ..." if len(beside) > _SHOWN else "")
     text = f"{path.name} holds several arrays that could be the cube. {chosen.described()} was taken, not {others}."
-    return chosen, (("dataset_chosen", f"{text} On the command line --cube FILE::DATASET takes another."),)
+    return chosen, (Notice("dataset_chosen", f"{text} On the command line --cube FILE::DATASET takes another."),)
 
 
 def _wanted(path: Path, variables: Sequence[Variable], wanted: str) -> Variable:
@@ -227,7 +227,7 @@ def _units_in_name(name: str) -> str | None:
 
 def cube_axes(
     cube: Variable, wavelengths: Variable | None, *, reversed_axes: bool
-) -> tuple[tuple[int, int, int], Warnings]:
+) -> tuple[tuple[int, int, int], Notices]:
     """Which stored axes are rows, columns and bands, and a warning where that was a guess.
 
     The band axis is the only one as long as the wavelengths, else the one named so, else the last one (the first
@@ -237,18 +237,18 @@ def cube_axes(
     named = [i for i, name in enumerate(cube.axes) if _BAND_AXIS_NAME.search(name)]
     count = max(wavelengths.shape) if wavelengths else None
     fitting = [i for i, side in enumerate(cube.shape) if side == count]
-    warnings: Warnings = ()
+    warnings: Notices = ()
     if len(named) == 1 and (not fitting or named[0] in fitting):
         band = named[0]
     elif len(fitting) == 1:
         band = fitting[0]
         if len(named) == 1:
             text = f"The axes' names of {cube.described()} do not fit its {count} wavelengths"
-            warnings = (("axes_assumed", f"{text}; number {band} is taken as the bands'."),)
+            warnings = (Notice("axes_assumed", f"{text}; number {band} is taken as the bands'."),)
     else:
         band = usual if usual in fitting or not fitting else fitting[-1]
         text = f"Nothing tells which axis of '{shown(cube.name)}' {cube.shape} is the bands'; number {band} it is."
-        warnings = (("axes_assumed", text),)
+        warnings = (Notice("axes_assumed", text),)
     row, col = (i for i in range(3) if i != band)
     swapped = reversed_axes
     if len(cube.axes) == 3:

@@ -18,9 +18,9 @@ import numpy as np
 from specimap_core.cube.declared_values import WORDS, Declared, check_counts, declared_of, plain
 from specimap_core.cube.printable import shown
 from specimap_core.cube.spectral_units import read_unit
-from specimap_core.cube.wavelengths import Warnings
 from specimap_core.errors import CubeHeaderError
 from specimap_core.geometry.cameras import Floats
+from specimap_core.notices import Notice, Notices
 
 MAGIC = "ENVI"
 _LARGEST_HEADER = 32 << 20
@@ -83,7 +83,7 @@ class EnviHeader:
     wavelength_units: str | None
     bad_band_list: Floats | None
     declared: Declared
-    warnings: Warnings
+    warnings: Notices
 
     @property
     def data_bytes(self) -> int:
@@ -202,10 +202,10 @@ class _Reader:
         interleave = self._required("interleave").lower()
         if interleave not in ("bsq", "bil", "bip"):
             raise self._wrong("interleave", "is none of bsq, bil, bip")
-        warnings: Warnings = ()
+        warnings: Notices = ()
         if "byte order" not in self._fields and dtype.itemsize > 1:
             text = "The header names no byte order; little endian is assumed."
-            warnings = (("byte_order_assumed", text),)
+            warnings = (Notice("byte_order_assumed", text),)
         return EnviHeader(
             rows,
             cols,
@@ -293,7 +293,7 @@ class _Reader:
     def _declared(self, bands: int) -> Declared:
         fields = {key: value.partition(";")[0] for key, value in self._fields.items() if plain(key) in WORDS}
         # Of a plot's titles the second is the values' own.
-        title, remarks = self._fields.get("z plot titles", "").partition(",")[2], self._fields.get("description")
-        declared = declared_of(self._name, fields, title, remarks=remarks)
+        title, description = self._fields.get("z plot titles", "").partition(",")[2], self._fields.get("description")
+        declared = declared_of(self._name, fields, title, description=description)
         check_counts(self._name, declared, bands)
         return declared

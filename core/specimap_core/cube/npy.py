@@ -16,9 +16,9 @@ from specimap_core.cube.model import Cube, check_dtype, describe
 from specimap_core.cube.pixels import ArrayPixels
 from specimap_core.cube.printable import shown
 from specimap_core.cube.unpacked import bytes_of, scratch_array
-from specimap_core.cube.wavelengths import Warnings
 from specimap_core.errors import CubeFormatError, CubeTruncatedError
 from specimap_core.geometry.cameras import Array, Floats
+from specimap_core.notices import Notice, Notices
 
 _NPY_MAGIC = b"\x93NUMPY"
 _ZIP_MAGIC = b"PK\x03\x04"
@@ -103,11 +103,11 @@ class NpyFormat:
                 advice="Save an array of three axes: rows x columns x bands.",
                 shape=list(header.shape),
             )
-        warnings: Warnings = ()
+        warnings: Notices = ()
         if header.shape[0] == min(header.shape) < min(header.shape[1:]):
             rows, cols, bands = header.shape
             text = f"The array is taken as {rows} rows x {cols} columns x {bands} bands, as .npy has no names for axes."
-            warnings = (("axes_assumed", text),)
+            warnings = (Notice("axes_assumed", text),)
         return describe(path, self.name, ArrayPixels(_mapped(path, header, header.header_bytes)), warnings=warnings)
 
 

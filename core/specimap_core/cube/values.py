@@ -17,8 +17,8 @@ from specimap_core.cube.outliers import bounds, clip_level, dead_elements, undec
 from specimap_core.cube.pixels import Pixels, sampled_rows
 from specimap_core.cube.scaled_pixels import MeantPixels, Missing, as_unsigned
 from specimap_core.cube.strided import to_bip
-from specimap_core.cube.wavelengths import Warnings
 from specimap_core.geometry.cameras import Array, Floats
+from specimap_core.notices import Notice, Notices
 
 Quantity = Literal["reflectance", "counts"]
 QUANTITY_OTHER = "quantity_not_reflectance"
@@ -41,7 +41,7 @@ class Meaning:
     quantity: Quantity
     to_reflectance: float | None
     saturation: Floats | None
-    warnings: Warnings
+    warnings: Notices
 
 
 def settle(file_name: str, stored: Pixels, bad_bands: NDArray[np.bool_], declared: Declared) -> Meaning:
@@ -105,22 +105,22 @@ def _thinned(values: Array, *, by_pixel: bool = False) -> Array:
     return values[:, ::step] if step > 1 else values
 
 
-def _missing(raw: Array, dtype: np.dtype, declared: Declared) -> tuple[Missing, Array, Warnings]:
+def _missing(raw: Array, dtype: np.dtype, declared: Declared) -> tuple[Missing, Array, Notices]:
     """Which stored values stand for none, the sample without them, and warnings."""
-    warnings: Warnings = ()
+    warnings: Notices = ()
     finite = [value for value in declared.no_data if np.isfinite(value)]
     possible = tuple(value for value in finite if _holds(dtype, value))
     impossible = [f"{value:g}" for value in finite if value not in possible]
     if impossible:
         text = f"The file's no-data value {', '.join(impossible)} is none that {dtype} can hold: nothing is left out."
-        warnings = (("no_data_impossible", text),)
+        warnings = (Notice("no_data_impossible", text),)
     low, high = declared.valid or (-np.inf, np.inf)
     missing = Missing(possible, low, high)
     values = _without(raw, missing)
     guessed = undeclared_no_data(values) if dtype.kind in "if" else None
     if guessed is not None:
         text = f"{guessed:g} stands where values are missing, though the file does not say so: it is taken for none."
-        warnings += (("no_data_undeclared", text),)
+        warnings += (Notice("no_data_undeclared", text),)
         missing = Missing((*possible, guessed), low, high)
         values = _without(raw, missing)
     if dtype.kind == "f" or dtype.itemsize > 2:
@@ -129,7 +129,7 @@ def _missing(raw: Array, dtype: np.dtype, declared: Declared) -> tuple[Missing, 
         if beyond:
             share = beyond / max(int(np.isfinite(values).sum()), 1)
             text = f"About {share:.2%} of the values lie far beyond all others (largest {_largest(values):.3g})"
-            warnings += (("values_absurd", f"{text}: dead pixels, or no-data. They are taken for no value."),)
+            warnings += (Notice("values_absurd", f"{text}: dead pixels, or no-data. They are taken for no value."),)
             missing = Missing(missing.equal, max(low, lowest), min(high, highest))
             values = _without(raw, missing)
     dead = dead_elements(values)
@@ -137,7 +137,7 @@ def _missing(raw: Array, dtype: np.dtype, declared: Declared) -> tuple[Missing, 
         columns = np.flatnonzero(dead.any(1))
         listed = ", ".join(map(str, columns[:8].tolist())) + (", ..." if len(columns) > 8 else "")
         text = f"{int(dead.sum())} detector elements are dead (columns {listed}); their values are taken for none."
-        warnings += (("detector_dead", text),)
+        warnings += (Notice("detector_dead", text),)
         missing = Missing(missing.equal, missing.low, missing.high, dead)
         values = np.where(dead, np.nan, values)
     return missing, values, warnings
@@ -163,19 +163,19 @@ def _without(raw: Array, missing: Missing) -> Array:
     return out
 
 
-def _to_reflectance(meant: Array, declared: Declared, *, real: bool) -> tuple[float | None, Warnings]:
+def _to_reflectance(meant: Array, declared: Declared, *, real: bool) -> tuple[float | None, Notices]:
     """What turns values into reflectance; None where they are something else."""
     bright = _bright(meant)
     if declared.divisor is None:
         seems = real and (_looks_like_reflectance(meant) or _called_so(meant, declared))
         if seems and declared.other is not None:
             text = f"The file calls its values {declared.other}: they are kept as they stand, and not as reflectance."
-            return None, ((QUANTITY_OTHER, text),)
+            return None, (Notice(QUANTITY_OTHER, text),)
         return (1.0 if seems else None), ()
     factor = declared.divisor
     if real and bright is not None and bright / factor < _LEAST_BRIGHT and _looks_like_reflectance(meant):
         text = f"'{declared.name('divisor')} = {factor:g}', but the values are reflectance already, up to {bright:.3g}"
-        return 1.0, (("reflectance_factor_unused", f"{text}: they are used as they stand."),)
+        return 1.0, (Notice("reflectance_factor_unused", f"{text}: they are used as they stand."),)
     return 1.0 / factor, ()
 
 
@@ -200,16 +200,16 @@ def _looks_like_reflectance(values: Array) -> bool:
     return bool(low >= _REFLECTANCE_RANGE[0] and high <= _REFLECTANCE_RANGE[1])
 
 
-def _percent(meant: Array) -> Warnings:
+def _percent(meant: Array) -> Notices:
     """A warning where what the file calls reflectance was not taken for it, and looks like percent."""
     bright = _bright(meant)
     if bright is None or not _REFLECTANCE_RANGE[1] < bright <= _MOST_PERCENT:
         return ()
     text = "The file calls its values reflectance, but they look like percent; they are kept as they stand."
-    return (("reflectance_implausible", text),)
+    return (Notice("reflectance_implausible", text),)
 
 
-def implausible(reflectance: Array, *, calibrated: bool = False) -> Warnings:
+def implausible(reflectance: Array, *, calibrated: bool = False) -> Notices:
     """A warning where what is called reflectance, a sample of it in good bands, cannot be.
 
     ``calibrated``: it was made of counts and references.
@@ -230,7 +230,7 @@ def implausible(reflectance: Array, *, calibrated: bool = False) -> Warnings:
         text = f"Half of the cube reflects more than {middle:.3g}: the scale seems wrong.{cause}"
     elif middle < _REFLECTANCE_RANGE[0]:
         text = f"Half of the cube has a reflectance below {middle:.2g}: offset or dark reference seem wrong."
-    return (("reflectance_implausible", text),) if text else ()
+    return (Notice("reflectance_implausible", text),) if text else ()
 
 
 def _saturation(level: float | None, gains: Floats | None, offsets: Floats | None, dtype: np.dtype) -> Floats | None:

@@ -8,6 +8,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from itertools import starmap
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from specimap_core.bundle_adjust.adjust import Adjusted
 from specimap_core.fiducials.observations import Observations
 from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
 from specimap_core.json_text import json_text
+from specimap_core.notices import Notice
 from specimap_core.photos.reading import Refusal
 from specimap_core.reconstruct.backend import CornersInPhotos, Reconstruction
 from specimap_core.reconstruct.dense.depth_map import DepthMap
@@ -140,7 +142,7 @@ def save_stage1(store: Store, key: str, stage: Stage1) -> None:
         "names": stage.names,
         "refused": [asdict(x) for x in stage.refused],
         "refused_later": [asdict(x) for x in r.refused],
-        "remarks": r.remarks,
+        "remarks": [(warning.code, warning.message) for warning in r.warnings],
         "marker_ids": c.marker_ids,
         "subject_mm": stage.subject_mm,
     }
@@ -168,7 +170,7 @@ def load_stage1(store: Store, key: str, *, with_depth: bool = True) -> Stage1 | 
         tuple(maps),
         arrays["points"],
         tuple(Refusal(**x) for x in meta["refused_later"]),
-        tuple((a, b) for a, b in meta["remarks"]),
+        tuple(starmap(Notice, meta["remarks"])),
     )
     seen = Observations(arrays["seen_photo"], arrays["seen_marker"], arrays["seen_corners"], arrays["seen_sigma"])
     return Stage1(

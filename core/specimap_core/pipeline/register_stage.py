@@ -22,13 +22,14 @@ from specimap_core.fiducials.layout import edge_lengths
 from specimap_core.fiducials.triangulation import triangulate
 from specimap_core.geometry.cameras import Floats, Pose, View
 from specimap_core.json_text import json_text
+from specimap_core.notices import Notice
 from specimap_core.pipeline.artefacts import Stage1, Stage2
 from specimap_core.pipeline.clock import Clock
 from specimap_core.pipeline.corners import cube_corners, photo_corners
 from specimap_core.pipeline.outputs import Outputs, staged
+from specimap_core.pipeline.run_warnings import run_warnings, with_assumptions
 from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.pipeline.stages import all_refused
-from specimap_core.pipeline.warnings import remarks_of, with_assumptions
 from specimap_core.register.accuracy import CornersInCube, camera_figures, homography_figures, spread
 from specimap_core.register.camera_refinement import settle_camera
 from specimap_core.register.cube_camera import CubeCamera
@@ -50,7 +51,6 @@ from specimap_core.report.model import (
     Parallax,
     Photos,
     Refused,
-    Remark,
     Report,
     Reprojection,
     SigmaFigures,
@@ -71,13 +71,13 @@ def register_and_write(
     settings: PipelineSettings,
     outputs: Outputs,
     clock: Clock,
-    remarks: list[tuple[str, str]],
+    warnings: list[Notice],
     inputs: dict[str, str],
 ) -> Report:
     """Register the cube, write all results; the report comes last."""
     adjusted, mesh = stage2.adjusted, stage2.mesh
     with clock.stage("register") as progress:
-        points, report = _register(stage1, stage2, cube, settings, caster, grids, remarks, inputs, clock, progress)
+        points, report = _register(stage1, stage2, cube, settings, caster, grids, warnings, inputs, clock, progress)
         report = gated(report, settings.adjust.edge_mm)
         with staged(outputs) as aside:
             write_mesh_ply(aside.mesh, mesh)
@@ -86,8 +86,7 @@ def register_and_write(
 
             def attributes(written: Written) -> dict[str, object]:
                 nonlocal report
-                found = [Remark(code=c, message=m) for c, m in written.remarks()]
-                report = report.model_copy(update={"warnings": [*report.warnings, *found]})
+                report = report.model_copy(update={"warnings": [*report.warnings, *written.warnings()]})
                 return {"report": report.summary(), "settings": settings.as_dict(), "inputs": inputs}
 
             write_cloud(aside.cloud, points, cube, attributes, progress=lambda share: progress(0.4 + 0.5 * share))
@@ -106,7 +105,7 @@ def _register(
     settings: PipelineSettings,
     caster: RayCaster,
     grids: tuple[Grid, Grid],
-    remarks: list[tuple[str, str]],
+    warnings: list[Notice],
     inputs: dict[str, str],
     clock: Clock,
     progress: Callable[[float], None],
@@ -189,9 +188,7 @@ def _register(
         photo_focal_px=adjusted.lens.focal_px,
         seconds=dict(clock.seconds),
         reused_stages=list(clock.reused),
-        warnings=[
-            Remark(code=c, message=m) for c, m in [*remarks, *remarks_of(stage1, adjusted, found), *settled.remarks()]
-        ],
+        warnings=[*warnings, *run_warnings(stage1, adjusted, found), *settled.warnings()],
         settings=settings.as_dict(),
         inputs=inputs,
         photo_corners=photo_corners(stage1, adjusted),

@@ -48,7 +48,7 @@ def run_pipeline(
         fingerprint = background.submit(cube.fingerprint)
         # Inspecting it early refuses a useless cube before minutes of work.
         mean = cube.mean_image()
-        remarks = [*cube.warnings, *inspect(cube, mean), *photo_folder(inputs.photos).remarks()]
+        warnings = [*cube.warnings, *inspect(cube, mean), *photo_folder(inputs.photos).warnings()]
         with ThreadPoolExecutor(workers) as pool:
             digests = {p.name: d for p, d in zip(paths, pool.map(_digest, paths), strict=True)}
         keys, store = surface_keys(digests, settings), outputs.store
@@ -74,7 +74,7 @@ def run_pipeline(
             settings,
             outputs,
             clock,
-            remarks,
+            warnings,
             {"key": key, "cube": fingerprint.result(), "photos": digest_of(digests)},
         )
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from specimap_core.cube import Cube, inspect, open_cube
 from specimap_core.errors import NotFoundError
+from specimap_core.notices import Notice
 from specimap_core.photos.folder import photo_paths
 from specimap_core.pipeline.artefacts import Stage1, Stage2, load_stage1, load_stage2
 from specimap_core.pipeline.clock import Clock, Progress
@@ -55,7 +56,7 @@ def _reconstruct(run: StageRun, clock: Clock) -> None:
     from specimap_core.pipeline.stages import reconstruct_stage
 
     # A useless cube is refused before minutes of work.
-    _remarks(_cube(run))
+    _warnings(_cube(run))
     store = Outputs(run.out).store
     reconstruct_stage(
         photo_paths(run.inputs.photos),
@@ -106,7 +107,7 @@ def _register(run: StageRun, clock: Clock) -> None:
         run.settings,
         outputs,
         clock,
-        _remarks(cube),
+        _warnings(cube),
         {"key": run.keys["register"], **run.hashes},
     )
 
@@ -115,7 +116,7 @@ def _cube(run: StageRun) -> Cube:
     return open_cube(run.inputs.cube, white=run.inputs.white, dark=run.inputs.dark)
 
 
-def _remarks(cube: Cube) -> list[tuple[str, str]]:
+def _warnings(cube: Cube) -> list[Notice]:
     return [*cube.warnings, *inspect(cube, cube.mean_image())]
 
 

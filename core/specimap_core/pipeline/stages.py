@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from specimap_core.bundle_adjust.adjust import adjust
 from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
 from specimap_core.native import preload
+from specimap_core.notices import Notice
 from specimap_core.photos.contact_sheet import contact_sheet
 from specimap_core.photos.reading import Photo, Refusal, read_photos, stated_focal_px
 from specimap_core.pipeline.artefacts import (
@@ -101,12 +102,12 @@ def reconstruct_stage(
             progress=lambda s: progress(0.2 + 0.8 * s),
         )
         if (zooms != 1).any():
-            remark = (
+            warning = Notice(
                 "focal_breathing",
                 f"The photos' focal lengths differ by {100 * zooms.std():.1f} % "
                 + ("(standard deviation); each photo was brought to the one they share."),
             )
-            reconstruction = replace(reconstruction, remarks=(*reconstruction.remarks, remark))
+            reconstruction = replace(reconstruction, warnings=(*reconstruction.warnings, warning))
         stage = Stage1(
             reconstruction,
             corners,

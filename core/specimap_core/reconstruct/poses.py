@@ -10,6 +10,7 @@ import numpy as np
 from specimap_core.errors import PhotosNotConnectedError, TooFewPhotosError
 from specimap_core.fiducials.layout import marker_frame
 from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
+from specimap_core.notices import Notices
 from specimap_core.photos.reading import Photo, Refusal, stated_focal_px
 from specimap_core.reconstruct.backend import CornersInPhotos, ReconstructSettings
 from specimap_core.reconstruct.features.choice import check_features
@@ -30,14 +31,14 @@ SOLVED = 0.05
 @dataclass(frozen=True)
 class Posed:
     """``photos``: indices of the posed photos, ascending; ``poses``: their ``cam_from_world`` in the marker frame, mm;
-    ``corners`` (Q, 4, 3) mm of the markers; ``refused``: photos left out and why; ``remarks``: (code, sentence)."""
+    ``corners`` (Q, 4, 3) mm of the markers; ``refused``: photos left out and why; ``warnings``: for the report."""
 
     photos: tuple[int, ...]
     lens: Intrinsics
     poses: tuple[Pose, ...]
     corners: Floats
     refused: tuple[Refusal, ...]
-    remarks: tuple[tuple[str, str], ...] = ()
+    warnings: Notices = ()
 
 
 def pose_photos(
@@ -102,7 +103,7 @@ def pose_photos(
             refused={r.name: r.reason for r in refused},
         )
     progress(1.0)
-    return Posed(used, lens, tuple(reached.poses[p] for p in used), placed, refused, reached.remarks)
+    return Posed(used, lens, tuple(reached.poses[p] for p in used), placed, refused, reached.warnings)
 
 
 def _in_marker_frame(solution: MarkerSolution) -> tuple[dict[int, Pose], dict[int, Pose], Floats]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from specimap_core.errors import BackendUnavailableError
 from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
+from specimap_core.notices import Notice, Notices
 from specimap_core.photos.reading import Photo
 from specimap_core.photos.texture import between_markers, in_words, usual_share
 from specimap_core.reconstruct.backend import CornersInPhotos, ReconstructSettings
@@ -25,7 +26,6 @@ SAME_POSE_DEG = 8.0
 SURE_INLIERS = 60
 """Matches that must agree on a pose by SIFT where ALIKED could have a try: with fewer, where glistening tissue was all
 that photos shared, poses were off by up to 7 degrees."""
-REMARK = "features_chosen"
 NAMES = {"sift": "SIFT", "aliked": "ALIKED with LightGlue"}
 ABSENT = "ALIKED, which may locate more, is not installed."
 
@@ -34,10 +34,10 @@ Share = Callable[[float], None]
 
 @dataclass(frozen=True)
 class Reached:
-    """``poses``: all photos posed, by index, in the marker frame, mm; ``remarks``: (code, sentence)."""
+    """``poses``: all photos posed, by index, in the marker frame, mm; ``warnings``: for the report."""
 
     poses: dict[int, Pose]
-    remarks: tuple[tuple[str, str], ...]
+    warnings: Notices
 
 
 def reach_by_places(
@@ -91,7 +91,7 @@ def reach_by_places(
             _unasked(lambda: by("aliked", ", for the rest,"), said)
         if open_photos:
             by("sift", ", now with fewer matches,")
-    return Reached(poses, ((REMARK, " ".join(said)),))
+    return Reached(poses, (Notice("features_chosen", " ".join(said)),))
 
 
 def _unasked(attempt: Callable[[], None], said: list[str]) -> None:
@@ -196,7 +196,7 @@ def reach_by_motion(
     if placed is None:
         return None
     poses, points = placed
-    return Reached(poses, ((REMARK, " ".join(said)),)), best.lens, points
+    return Reached(poses, (Notice("features_chosen", " ".join(said)),)), best.lens, points
 
 
 def _angle_deg(a: Pose, b: Pose) -> float:

@@ -16,6 +16,7 @@ import numpy as np
 from specimap_core.errors import RegistrationError
 from specimap_core.geometry.cameras import Floats, View
 from specimap_core.geometry.pushbroom import ScanView
+from specimap_core.notices import Notice
 from specimap_core.register.accuracy import CornersInCube
 from specimap_core.register.camera_fitting import Sight
 from specimap_core.register.camera_models import FRAME
@@ -86,25 +87,25 @@ class Settled:
             alone = float(np.hypot(self.camera.rms_px * self.camera.pixel_mm, self.open_mm))
         return float(np.sqrt(alone**2 + self.kinds_mm**2 + self.unfit_mm**2))
 
-    def remarks(self) -> list[tuple[str, str]]:
-        """What the report should say of it."""
-        said: list[tuple[str, str]] = []
+    def warnings(self) -> list[Notice]:
+        """Warnings for the report."""
+        warnings: list[Notice] = []
         view, aspect = self.camera.view, self.camera.view.intrinsics.aspect
         if isinstance(view, ScanView):
             text = f"The cube was recorded one of its {view.scan} at a time, as markers and specimen show: "
-            said.append(("cube_camera_not_frame", text + "a push-broom camera was solved."))
+            warnings.append(Notice("cube_camera_not_frame", text + "a push-broom camera was solved."))
         if abs(aspect - 1) > SQUARE:
             text = f"The cube's pixels are {aspect:.3f} times as high as they are wide; this was accounted for."
-            said.append(("cube_pixels_not_square", text))
+            warnings.append(Notice("cube_pixels_not_square", text))
         if self.shift is not None and self.moved:
-            said.append(("specimen_moved", self.shift.message))
+            warnings.append(Notice("specimen_moved", self.shift.message))
         if self.unfit_mm:
             text = f"No camera sees markers and specimen as the cube shows them: about {self.unfit_mm:.2f} mm remain."
-            said.append(("cube_camera_unfit", text))
+            warnings.append(Notice("cube_camera_unfit", text))
         elif self.camera_mm > LOOSE_MM:
             text = f"The markers in the cube leave open where raised tissue lies, by about {self.camera_mm:.1f} mm."
-            said.append(("cube_camera_loose", text))
-        return said
+            warnings.append(Notice("cube_camera_loose", text))
+        return warnings
 
 
 def settle_camera(

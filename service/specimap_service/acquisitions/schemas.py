@@ -43,7 +43,7 @@ Dictionary = Literal[
 """Those of OpenCV, which the service does not load."""
 
 
-class Remark(BaseModel):
+class CubeNotice(BaseModel):
     """Something about a cube that does not keep it from being used."""
 
     code: str
@@ -87,7 +87,7 @@ class CubeJudgement(Judged):
     found_bytes: int | None = Field(None, description="Of the data, where they are too few.")
     field: str | None = Field(None, description="The header's field that is wrong.")
     wavelength_nm: tuple[float, float] | None = Field(None, description="Shortest and longest.")
-    warnings: list[Remark] = []
+    warnings: list[CubeNotice] = []
 
 
 Judgement = Annotated[PhotoJudgement | CubeJudgement, Field(discriminator="kind")]

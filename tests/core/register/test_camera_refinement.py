@@ -99,7 +99,7 @@ def test_four_sharp_markers_hold_the_camera_and_the_specimen_agrees(
     found = case(picture, caster, ALL, SHARP_PX, seed)
     settled = found.settled
     assert settled.by_specimen
-    assert settled.remarks() == []
+    assert settled.warnings() == []
     assert settled.shift is not None
     assert not settled.shift.significant
     assert 0 < settled.sideways_mm < settled.open_mm < LOOSE_MM
@@ -117,7 +117,7 @@ def test_what_markers_leave_open_the_specimen_settles(caster: RayCaster, picture
         assert found.after_mm < min(found.before_mm, 3 * settled.shift.sigma_mm)
         # Two measurements of one place are together surer than either.
         assert SHARED_MM / 2 < settled.sideways_mm < min(settled.open_mm, settled.shift.sigma_mm)
-        assert settled.remarks() == []
+        assert settled.warnings() == []
     before, after = (float(np.median(m)) for m in zip(*((c.before_mm, c.after_mm) for c in cases), strict=True))
     assert before > LOOSE_MM
     assert 0.002 < after < 2 * SHARED_MM
@@ -128,11 +128,11 @@ def test_what_nothing_settles_is_said(caster: RayCaster, picture: Image) -> None
     flat = RayCaster(bump_mesh(height_mm=0.1))
     for image, surface, seed in [(blank, caster, 0), (blank, caster, 1), (seen(flat.mesh), flat, 0)]:
         found = case(image, surface, ALL, 2 * BLURRED_PX, seed)
-        assert [code for code, _ in found.settled.remarks()] == ["cube_camera_loose"]
+        assert [w.code for w in found.settled.warnings()] == ["cube_camera_loose"]
         assert not found.settled.by_specimen
         assert found.settled.shift is None
         assert found.settled.sideways_mm >= found.settled.open_mm > LOOSE_MM
-        assert f"{found.settled.sideways_mm:.1f} mm" in found.settled.remarks()[0][1]
+        assert f"{found.settled.sideways_mm:.1f} mm" in found.settled.warnings()[0].message
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -145,7 +145,7 @@ def test_a_moved_specimen_does_not_draw_the_camera_along(caster: RayCaster, seed
         assert found.after_mm == found.before_mm
         # A motion is no fault of the camera's.
         loose = ["cube_camera_loose"] if found.settled.camera_mm > LOOSE_MM else []
-        assert [code for code, _ in found.settled.remarks()] == ["specimen_moved", *loose]
+        assert [w.code for w in found.settled.warnings()] == ["specimen_moved", *loose]
         assert noise_px > SHARP_PX or not loose
         # What the camera itself is off by is part of what is seen of the motion.
         assert found.settled.sideways_mm == pytest.approx(moved, abs=found.before_mm + SHARED_MM)

@@ -16,7 +16,7 @@ from specimap_core.reconstruct.backend import CornersInPhotos
 from specimap_core.reconstruct.pose_check import strays
 from specimap_core.report.model import PhotoCorners, Report
 from specimap_core.report.quality_gates import gated, outlying_photos
-from specimap_core.report.wording import GRAVE, REMARKS, checks, verdict
+from specimap_core.report.wording import GRAVE, WARNING_ADVICE, checks, verdict
 from tests.support.broken_sets import card_moved, copied, sheared
 from tests.support.document_scene import full_report, square
 from tests.support.scenes import EDGE_MM, SMALL, Finished, OnDisk, marker_scene, phantom_on_disk, run_refused, specimap
@@ -77,7 +77,7 @@ def test_each_figure_beyond_its_limit_is_said_twice(changes: dict[str, Any], cod
     said = verdict(found)
     assert said.level == "attention"
     assert said.actions
-    assert REMARKS[code]
+    assert WARNING_ADVICE[code]
     failed = [c for c in checks(found) if not c.good]
     assert failed or code in GRAVE
 

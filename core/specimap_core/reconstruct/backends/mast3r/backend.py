@@ -12,6 +12,7 @@ import numpy as np
 
 from specimap_core.errors import TooFewPhotosError
 from specimap_core.geometry.cameras import Intrinsics, Pose
+from specimap_core.notices import Notice
 from specimap_core.photos.reading import Photo, Refusal
 from specimap_core.reconstruct.backend import (
     CornersInPhotos,
@@ -31,14 +32,14 @@ from specimap_core.reconstruct.backends.mast3r.settings import (
     settings_from_environment,
     weights_of,
 )
-from specimap_core.reconstruct.backends.warnings import left_out, ran
+from specimap_core.reconstruct.backends.network_warnings import backend_run, depth_unaligned
 from specimap_core.sandbox.process import Answer, run_child
 
 CHILD = Path(__file__).with_name("child.py")
 STEPS = {"load": 3.0, "pairs": 70.0, "views": 5.0, "coarse": 9.0, "fine": 11.0, "depth": 2.0}
 """The child's steps and about how the time falls on them, on a GPU with 20 photos."""
 LEAST_PHOTOS = 3
-LICENCE = (
+LICENCE = Notice(
     "licence_non_commercial",
     "MASt3R's code and weights are CC BY-NC-SA 4.0: non-commercial use only.",
 )
@@ -126,7 +127,11 @@ class Mast3rBackend:
             maps,
             sparse_points(list(maps), kept),
             refused,
-            (LICENCE, ran("MASt3R", answer.facts, weights), *left_out("MASt3R", "the markers", without, len(used))),
+            (
+                LICENCE,
+                backend_run("MASt3R", answer.facts, weights),
+                *depth_unaligned("MASt3R", "the markers", without, len(used)),
+            ),
         )
 
 

@@ -1,0 +1,58 @@
+"""The catalogue of notices holds every code that the source can give, each with its advice and a line in the docs."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from specimap_core.notices import CATALOGUE
+from specimap_core.report.wording import GRAVE, WARNING_ADVICE
+from tests.support.error_tables import table_of
+from tests.support.places import ROOT
+
+
+def codes_in(source: str) -> Iterator[str]:
+    """Codes of the notices that a module makes: texts, or constants of that module."""
+    tree = ast.parse(source)
+    constants = {
+        target.id: node.value
+        for node in tree.body
+        if isinstance(node, ast.Assign)
+        for target in node.targets
+        if isinstance(target, ast.Name)
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Notice":
+            code = node.args[0]
+            while isinstance(code, ast.Name | ast.Subscript):
+                code = constants[code.id] if isinstance(code, ast.Name) else code.value
+            for value in code.values if isinstance(code, ast.Dict) else [code]:
+                assert isinstance(value, ast.Constant), f"line {node.lineno}: the code of a notice is no constant"
+                yield str(value.value)
+
+
+def modules() -> list[Path]:
+    return sorted((ROOT / "core" / "specimap_core").rglob("*.py"))
+
+
+def test_the_catalogue_lists_the_codes_that_the_source_gives() -> None:
+    given = {code for path in modules() for code in codes_in(path.read_text("utf-8"))}
+    assert given == set(CATALOGUE)
+
+
+def test_the_search_for_codes_finds_them() -> None:
+    source = 'C = "b"\nD = {"x": "c", "y": "d"}\nNotice("a", "")\nNotice(C, "")\nNotice(D[k], "")\n'
+    assert list(codes_in(source)) == ["a", "b", "c", "d"]
+    with pytest.raises(AssertionError, match="line 1"):
+        list(codes_in('Notice(f"{name}_differs", "")'))
+
+
+def test_each_code_has_its_advice_and_a_line_in_the_docs() -> None:
+    assert set(WARNING_ADVICE) == set(CATALOGUE) == table_of("Warnings")
+    assert set(GRAVE) < set(CATALOGUE)
+    for code, kind in CATALOGUE.items():
+        assert len(kind.meaning) > 20, code
+        assert not kind.meaning.endswith("."), code
