@@ -12,7 +12,7 @@ from rich.console import Console
 from specimap_core.photos.folder import photo_paths
 from specimap_core.pipeline.clock import Clock
 from specimap_core.pipeline.outputs import Outputs
-from specimap_core.pipeline.register_stage import triangulated_edges
+from specimap_core.pipeline.report_builder import triangulated_edges
 from specimap_core.pipeline.settings import settings_from
 from specimap_core.pipeline.stages import adjust_stage, reconstruct_stage
 

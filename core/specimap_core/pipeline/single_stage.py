@@ -8,7 +8,7 @@ from pathlib import Path
 
 from specimap_core.cube import Cube, inspect, open_cube
 from specimap_core.errors import NotFoundError
-from specimap_core.notices import Notice
+from specimap_core.notices import Notices
 from specimap_core.photos.folder import photo_paths
 from specimap_core.pipeline.artefacts import Stage1, Stage2, load_stage1, load_stage2
 from specimap_core.pipeline.clock import Clock, Progress
@@ -88,8 +88,9 @@ def _render(run: StageRun, clock: Clock) -> None:
 
 def _register(run: StageRun, clock: Clock) -> None:
     from specimap_core.pipeline.artefacts import load_grids
-    from specimap_core.pipeline.register_stage import register_and_write
+    from specimap_core.pipeline.register_stage import CubeInput, register_stage
     from specimap_core.pipeline.stages import render_stage
+    from specimap_core.register.registration import Surface
     from specimap_core.surface.raycast import RayCaster
 
     outputs, cube = Outputs(run.out), _cube(run)
@@ -98,26 +99,17 @@ def _register(run: StageRun, clock: Clock) -> None:
     store, key = outputs.store, run.keys["render"]
     # Rendered again only where the grids are of another run of stage 2.
     grids = load_grids(store, key, stage2.mesh) or render_stage(stage2, caster, run.settings, store, key, clock)
-    register_and_write(
-        stage1,
-        stage2,
-        caster,
-        grids,
-        cube,
-        run.settings,
-        outputs,
-        clock,
-        _warnings(cube),
-        {"key": run.keys["register"], **run.hashes},
-    )
+    surface = Surface(stage2.adjusted, stage2.sigma_mm, caster, *grids)
+    given = CubeInput(cube, _warnings(cube), {"key": run.keys["register"], **run.hashes})
+    register_stage(stage1, surface, given, run.settings, outputs, clock)
 
 
 def _cube(run: StageRun) -> Cube:
     return open_cube(run.inputs.cube, white=run.inputs.white, dark=run.inputs.dark)
 
 
-def _warnings(cube: Cube) -> list[Notice]:
-    return [*cube.warnings, *inspect(cube, cube.mean_image())]
+def _warnings(cube: Cube) -> Notices:
+    return cube.warnings + inspect(cube, cube.mean_image())
 
 
 def _stage1(run: StageRun, *, with_depth: bool) -> Stage1:

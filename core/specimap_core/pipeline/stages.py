@@ -14,7 +14,7 @@ from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
 from specimap_core.native import preload
 from specimap_core.notices import Notice
 from specimap_core.photos.contact_sheet import contact_sheet
-from specimap_core.photos.reading import Photo, Refusal, read_photos, stated_focal_px
+from specimap_core.photos.reading import Photo, read_photos, stated_focal_px
 from specimap_core.pipeline.artefacts import (
     Stage1,
     Stage2,
@@ -209,8 +209,3 @@ def render_stage(
         fine = render_grid(caster, low, high, settings.render.r_pc_mm)
         save_grids(store, key, (coarse, fine), stage2.mesh)
         return coarse, fine
-
-
-def all_refused(stage1: Stage1) -> list[Refusal]:
-    """Photos refused while reading and while reconstructing."""
-    return [*stage1.refused, *stage1.reconstruction.refused]

@@ -17,9 +17,9 @@ from specimap_core.errors import RegistrationError
 from specimap_core.geometry.cameras import Floats, View
 from specimap_core.geometry.pushbroom import ScanView
 from specimap_core.notices import Notice
-from specimap_core.register.accuracy import CornersInCube
 from specimap_core.register.camera_fitting import Sight
 from specimap_core.register.camera_models import FRAME
+from specimap_core.register.corners import CornersInCube
 from specimap_core.register.cube_camera import Anchor, CubeCamera, solve_camera
 from specimap_core.register.cube_markers import CubeMarkers
 from specimap_core.register.model_selection import Choice, choose_camera
@@ -39,13 +39,13 @@ MOVED_OVER_UNFIT = 3.0
 SQUARE = 0.005
 """An aspect nearer to 1 than this is not worth a word."""
 ROUNDS = 3
-SETTLED_MM = 0.01
+CONVERGED_MM = 0.01
 """Rounds end when the specimen moves by less in the cube."""
 SAMPLE = 500
 
 
 @dataclass(frozen=True)
-class Settled:
+class RefinedCamera:
     """The solved ``camera``; ``open_mm``: how far the markers leave open, sideways, where the specimen lies, one
     standard deviation; ``by_specimen``: whether the specimen had a say; ``shift`` that is left, if it can be told.
 
@@ -108,9 +108,9 @@ class Settled:
         return warnings
 
 
-def settle_camera(
+def refine_camera(
     seen: CornersInCube, found: CubeMarkers, rows: int, cols: int, caster: RayCaster, corners: Floats
-) -> Settled:
+) -> RefinedCamera:
     """Solve the cube's camera on the corners ``seen``; ``found``: the markers with the image they show in;
     ``corners`` (Q, 4, 3) mm of all markers.
 
@@ -131,17 +131,17 @@ def settle_camera(
 
     choice = choose_camera(Sight(*flat), rows, cols, square, sample, sight)
     if choice.model is FRAME and square is not None and not choice.unfit_mm:
-        return _settle_square(square, choice, seen, rows, cols, sample, sight)
+        return _refine_square(square, choice, seen, rows, cols, sample, sight)
     camera, alone = choice.fit.camera, choice.alone.camera
     if not len(sample):
-        return Settled(camera, alone.sideways_mm(flat[0]), False, None, unfit_mm=choice.unfit_mm)
+        return RefinedCamera(camera, alone.sideways_mm(flat[0]), False, None, unfit_mm=choice.unfit_mm)
     left_open = alone.sideways_mm(sample)
     joint_mm = float(np.hypot(camera.sideways_mm(sample), JOINT_MM)) if choice.by_specimen else None
     shift = shift_of(last) if choice.moved and (last := sight(camera.view)) is not None else None
-    return Settled(camera, left_open, choice.by_specimen, shift, joint_mm, choice.open_mm, choice.unfit_mm)
+    return RefinedCamera(camera, left_open, choice.by_specimen, shift, joint_mm, choice.open_mm, choice.unfit_mm)
 
 
-def _settle_square(
+def _refine_square(
     camera: CubeCamera,
     choice: Choice,
     seen: CornersInCube,
@@ -149,11 +149,11 @@ def _settle_square(
     cols: int,
     sample: Floats,
     sight: Callable[[View], Sighting | None],
-) -> Settled:
+) -> RefinedCamera:
     """A frame camera of square pixels: by its markers, or with the specimen's middle where they leave it open."""
     flat, markers = seen.flat(), len(seen.marker_ids)
     if not len(sample):
-        return Settled(camera, camera.sideways_mm(flat[0]), False, None)
+        return RefinedCamera(camera, camera.sideways_mm(flat[0]), False, None)
     centre, left_open, settled = sample.mean(0), camera.sideways_mm(sample), False
 
     def look(camera: CubeCamera) -> Shift | None:
@@ -174,7 +174,7 @@ def _settle_square(
         )
         settled = True
         shift = look(camera)
-        if _apart_mm(before, camera, centre) < SETTLED_MM:
+        if _apart_mm(before, camera, centre) < CONVERGED_MM:
             break
     if not settled and markers < LEAST_MARKERS:
         shift = None
@@ -182,7 +182,7 @@ def _settle_square(
     if shift is not None and shift.significant and choice.by_specimen and not choice.moved:
         # Tiles lie elsewhere, but not as those of something that moved as a whole.
         unfit_mm, shift = shift.moved_mm, None
-    return Settled(camera, left_open, settled, shift, kinds_mm=choice.open_mm, unfit_mm=unfit_mm)
+    return RefinedCamera(camera, left_open, settled, shift, kinds_mm=choice.open_mm, unfit_mm=unfit_mm)
 
 
 def _apart_mm(before: CubeCamera, after: CubeCamera, point: Floats) -> float:

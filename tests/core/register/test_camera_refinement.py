@@ -13,11 +13,10 @@ from specimap_core.cloud import Cloud, Flag
 from specimap_core.cube import open_cube
 from specimap_core.geometry.cameras import fit_similarity
 from specimap_core.pipeline.outputs import Inputs
-from specimap_core.pipeline.register_stage import corners_in_cube
 from specimap_core.pipeline.run import run_pipeline
 from specimap_core.pipeline.settings import PipelineSettings
-from specimap_core.register.accuracy import CornersInCube
-from specimap_core.register.camera_refinement import LOOSE_MM, Settled, settle_camera
+from specimap_core.register.camera_refinement import LOOSE_MM, RefinedCamera, refine_camera
+from specimap_core.register.corners import CornersInCube, corners_in_cube
 from specimap_core.register.cube_camera import CubeCamera, solve_camera
 from specimap_core.register.cube_markers import CubeMarkers, find_markers
 from specimap_core.register.specimen_motion import SHARED_MM
@@ -54,7 +53,7 @@ class Case:
     """A camera by the markers ``alone``, and ``settled``; how far the textured bump is off in either, mm."""
 
     alone: CubeCamera
-    settled: Settled
+    settled: RefinedCamera
     before_mm: float
     after_mm: float
 
@@ -85,7 +84,7 @@ def case(image: Image, caster: RayCaster, ids: tuple[int, ...], noise_px: float,
     corners = CornersInCube(ids, CORNERS[list(ids)], pixels, sigma)
     found = CubeMarkers(ids, pixels, sigma, image, "band mean", False)
     alone = solve_camera(*corners.flat(), ROWS, COLS)
-    settled = settle_camera(corners, found, ROWS, COLS, caster, CORNERS)
+    settled = refine_camera(corners, found, ROWS, COLS, caster, CORNERS)
     return Case(alone, settled, off_mm(alone), off_mm(settled.camera))
 
 
@@ -154,7 +153,7 @@ def test_a_moved_specimen_does_not_draw_the_camera_along(caster: RayCaster, seed
 # ---- whole runs ---------------------------------------------------------------------------------------
 
 
-def resolved(folder: Path) -> tuple[float, float, Settled]:
+def resolved(folder: Path) -> tuple[float, float, RefinedCamera]:
     """How far the specimen's true places show from their pixels, sideways, mm: by the run's markers alone, and settled
     as in its stage 4."""
     truth, stage2, cube = load_truth(folder), stage2_of(folder / "out"), open_cube(folder / "hsi" / "hsi.hdr")
@@ -162,7 +161,7 @@ def resolved(folder: Path) -> tuple[float, float, Settled]:
     found = find_markers(cube, "DICT_4X4_50", adjusted.marker_ids)
     corners = corners_in_cube(found, adjusted, cube.cols)
     alone = solve_camera(*corners.flat(), cube.rows, cube.cols)
-    settled = settle_camera(corners, found, cube.rows, cube.cols, RayCaster(stage2.mesh), adjusted.corners)
+    settled = refine_camera(corners, found, cube.rows, cube.cols, RayCaster(stage2.mesh), adjusted.corners)
     true_corners = truth.marker_corners[[list(truth.marker_ids).index(i) for i in adjusted.marker_ids]]
     _, R, t = fit_similarity(true_corners.reshape(-1, 3), adjusted.corners.reshape(-1, 3))
     pixels = np.argwhere(truth.hsi_class == CLASS_SPECIMEN)

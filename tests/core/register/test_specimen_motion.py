@@ -14,7 +14,7 @@ from specimap_core.pipeline.artefacts import Stage2
 from specimap_core.pipeline.outputs import Inputs
 from specimap_core.pipeline.run import run_pipeline
 from specimap_core.pipeline.settings import PipelineSettings
-from specimap_core.register.accuracy import CornersInCube
+from specimap_core.register.corners import CornersInCube
 from specimap_core.register.cube_camera import solve_camera
 from specimap_core.register.cube_markers import find_markers
 from specimap_core.register.specimen_motion import ALLOWED_MM, Shift, specimen_shift
