@@ -23,7 +23,7 @@ from specimap_core.truth.truth_file import Truth
 
 
 class Scene:
-    """``settled``: the cube's camera as the run solves it; ``true_camera``: as it was, in the run's frame; ``ours``
+    """``refined``: the cube's camera as the run solves it; ``true_camera``: as it was, in the run's frame; ``ours``
     takes the truth's frame into the run's."""
 
     def __init__(self, folder: Path, truth: Truth, stage1: Stage1, stage2: Stage2, settings: PipelineSettings) -> None:
@@ -33,8 +33,8 @@ class Scene:
         found = find_markers(cube, settings.reconstruct.dictionary, stage2.adjusted.marker_ids)
         seen: CornersInCube = corners_in_cube(found, stage2.adjusted, cube.cols)
         self.caster = RayCaster(stage2.mesh)
-        self.settled = refine_camera(seen, found, cube.rows, cube.cols, self.caster, stage2.adjusted.corners)
-        self.camera = self.settled.camera.view
+        self.refined = refine_camera(seen, found, cube.rows, cube.cols, self.caster, stage2.adjusted.corners)
+        self.camera = self.refined.camera.view
         ids = list(truth.marker_ids)
         self.true_corners = truth.marker_corners[[ids.index(i) for i in stage2.adjusted.marker_ids]]
         _, R, t = fit_similarity(self.true_corners.reshape(-1, 3), stage2.adjusted.corners.reshape(-1, 3))

@@ -8,7 +8,7 @@ from specimap_core.notices import Notice
 
 
 @dataclass(frozen=True)
-class Written:
+class WriteSummary:
     """Points of the cloud; those flagged SATURATED and NO_DATA; values of good bands that did not fit and were clipped
     to ``least`` or ``largest``, the ends of what the cloud can hold; those ``absurd`` ones that were left out."""
 

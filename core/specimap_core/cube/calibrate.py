@@ -38,11 +38,11 @@ def calibrated(raw: Cube, white: Cube, dark: Cube | None) -> Cube:
     reflectance is NaN. Saturation stays that of the raw counts. Raises CubeContentError for a reference whose columns
     or bands do not fit.
     """
-    warnings: Notices = _fit(raw, white, "white") + (_fit(raw, dark, "dark") if dark else ())
+    warnings: Notices = _check_fit(raw, white, "white") + (_check_fit(raw, dark, "dark") if dark else ())
     scales, about_units = _to_common_units(raw, white, dark)
     warnings += about_units
     white_line = _mean_line(white)
-    warnings += _saturated(white, white_line)
+    warnings += _saturation_warning(white, white_line)
     white_line *= scales[0]
     dark_line = np.zeros_like(white_line) if dark is None else _mean_line(dark) * scales[1]
     if dark is None:
@@ -79,7 +79,7 @@ def calibrated(raw: Cube, white: Cube, dark: Cube | None) -> Cube:
     )
 
 
-def _fit(raw: Cube, reference: Cube, name: Literal["white", "dark"]) -> Notices:
+def _check_fit(raw: Cube, reference: Cube, name: Literal["white", "dark"]) -> Notices:
     if reference.bands != raw.bands or reference.cols not in (1, raw.cols):
         raise CubeContentError(
             f"The {name} reference has {reference.cols} columns and {reference.bands} bands, "
@@ -115,7 +115,7 @@ def _to_common_units(raw: Cube, white: Cube, dark: Cube | None) -> tuple[tuple[f
     return (white_factor / raw_factor, dark_factor / raw_factor), ()
 
 
-def _saturated(white: Cube, line: Floats) -> Notices:
+def _saturation_warning(white: Cube, line: Floats) -> Notices:
     """A warning where the white reference itself clips, on average over its rows, in a good band."""
     if white.saturation is None:
         return ()

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from specimap_core.cube.model import readable_dtype
-from specimap_core.cube.printable import shown
+from specimap_core.cube.printable import printable
 from specimap_core.cube.spectral_units import read_unit
 from specimap_core.errors import CubeFormatError, CubeHeaderError
 from specimap_core.notices import Notice, Notices
@@ -63,8 +63,8 @@ class Variable:
         """Name and shape, with the axes' names where they have some: ``'L1/data' (y 512, x 640, band 61)``."""
         named = len(self.axes) == len(self.shape) and any(self.axes)
         axes = self.axes if named else ("",) * len(self.shape)
-        sides = [f"{shown(axis)} {side}".strip() for axis, side in zip(axes, self.shape, strict=True)]
-        return f"'{shown(self.name)}' ({', '.join(sides[:_SHOWN])}{', ...' if len(sides) > _SHOWN else ''})"
+        sides = [f"{printable(axis)} {side}".strip() for axis, side in zip(axes, self.shape, strict=True)]
+        return f"'{printable(self.name)}' ({', '.join(sides[:_SHOWN])}{', ...' if len(sides) > _SHOWN else ''})"
 
 
 def choose_cube(path: Path, variables: Sequence[Variable], wanted: str | None = None) -> tuple[Variable, Notices]:
@@ -103,7 +103,7 @@ def _wanted(path: Path, variables: Sequence[Variable], wanted: str) -> Variable:
     )
     if len(named) != 1:
         what = "several arrays" if named else "no array"
-        raise _refusal(path, f"{what} called '{shown(wanted)}'", named or variables)
+        raise _refusal(path, f"{what} called '{printable(wanted)}'", named or variables)
     chosen = named[0]
     if not readable_dtype(chosen.dtype):
         raise _wrong_type(path, chosen)
@@ -131,10 +131,10 @@ def _preferred(found: Sequence[Variable], variables: Sequence[Variable]) -> Vari
 
 def _wrong_type(path: Path, variable: Variable) -> CubeHeaderError:
     return CubeHeaderError(
-        f"'{shown(variable.name)}' in {path.name} holds values of type {shown(str(variable.dtype))}.",
+        f"'{printable(variable.name)}' in {path.name} holds values of type {printable(str(variable.dtype))}.",
         advice="Save the cube as integers or real floating-point numbers.",
         field="dtype",
-        value=shown(str(variable.dtype)),
+        value=printable(str(variable.dtype)),
     )
 
 
@@ -146,7 +146,7 @@ def _refusal(path: Path, what: str, variables: Sequence[Variable]) -> CubeFormat
     return CubeFormatError(
         f"{path.name} holds {what}{f': {listed}' if listed else ''}.",
         advice=several if sum(len(v.shape) == 3 for v in arrays) > 1 else alone,
-        variables=[shown(v.name) for v in arrays[:20]],
+        variables=[printable(v.name) for v in arrays[:20]],
         shapes=[list(v.shape[:_SHOWN]) for v in arrays[:20]],
     )
 
@@ -247,7 +247,7 @@ def cube_axes(
             warnings = (Notice("axes_assumed", f"{text}; number {band} is taken as the bands'."),)
     else:
         band = usual if usual in fitting or not fitting else fitting[-1]
-        text = f"Nothing tells which axis of '{shown(cube.name)}' {cube.shape} is the bands'; number {band} it is."
+        text = f"Nothing tells which axis of '{printable(cube.name)}' {cube.shape} is the bands'; number {band} it is."
         warnings = (Notice("axes_assumed", text),)
     row, col = (i for i in range(3) if i != band)
     swapped = reversed_axes

@@ -177,7 +177,7 @@ def _truncated(path: Path, expected: int, found: int) -> CubeTruncatedError:
     )
 
 
-def _longer(excess: int) -> Notices:
+def _excess(excess: int) -> Notices:
     if not excess:
         return ()
     return (Notice("data_longer_than_header", f"The data hold {excess} bytes more than the header says."),)
@@ -189,7 +189,7 @@ def _mapped(path: Path, header: EnviHeader) -> tuple[Array, Notices]:
         raise _truncated(path, expected, size)
     count = (expected - header.offset) // header.dtype.itemsize
     data = np.memmap(path, header.dtype, "r", offset=header.offset, shape=(count,))
-    return np.asarray(data), _longer(size - expected)
+    return np.asarray(data), _excess(size - expected)
 
 
 def _unpacked(path: Path, header: EnviHeader) -> tuple[Array, Notices]:
@@ -218,4 +218,4 @@ def _unpacked(path: Path, header: EnviHeader) -> tuple[Array, Notices]:
             advice="Correct 'file compression' in the header, or copy the data again.",
             field="file compression",
         ) from error
-    return out, _longer(excess)
+    return out, _excess(excess)

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from specimap_core.cube.declared_values import WORDS, Declared, check_counts, declared_of, plain
-from specimap_core.cube.printable import shown
+from specimap_core.cube.printable import printable
 from specimap_core.cube.spectral_units import read_unit
 from specimap_core.errors import CubeHeaderError
 from specimap_core.geometry.cameras import Floats
@@ -42,7 +42,7 @@ _COMPLEX_TYPES = (6, 9)
 # Kinds of file that carry an ENVI header, but no plain cube of spectra behind it.
 _OTHER_FILE_TYPES = ("classification", "spectral library", "meta", "virtual", "tiff", "jpeg", "nitf", "hdf")
 # Two lines of one of these that differ leave open what the data mean.
-_TOLD_ONCE = (
+_UNIQUE_FIELDS = (
     "samples",
     "lines",
     "bands",
@@ -152,16 +152,16 @@ def parse_fields(name: str, text: str) -> dict[str, str]:
                 following = next(lines, None)
                 if following is None:
                     raise CubeHeaderError(
-                        f"{name}: the list of '{shown(key)}' is not closed; the header is cut short.",
+                        f"{name}: the list of '{printable(key)}' is not closed; the header is cut short.",
                         advice="Copy the header again from where it was recorded.",
                         field=key,
                     )
                 if not following.lstrip().startswith(";"):
                     parts.append(following)
             value = "\n".join(parts).rpartition("}")[0].strip()
-        if key in _TOLD_ONCE and key in fields and not _same(fields[key], value):
+        if key in _UNIQUE_FIELDS and key in fields and not _same(fields[key], value):
             raise CubeHeaderError(
-                f"{name} gives '{key}' twice, as {shown(fields[key])!r} and {shown(value)!r}.",
+                f"{name} gives '{key}' twice, as {printable(fields[key])!r} and {printable(value)!r}.",
                 advice="Keep the right one of the two lines.",
                 field=key,
             )
@@ -223,12 +223,12 @@ class _Reader:
 
     def _wrong(self, field: str, why: str) -> CubeHeaderError:
         value = self._fields.get(field, "")
-        told = shown(value)
+        stated = printable(value)
         return CubeHeaderError(
-            f"{self._name}: '{field} = {told}' {why}.",
+            f"{self._name}: '{field} = {stated}' {why}.",
             advice=f"Correct '{field}' in the header, or export the cube again.",
             field=field,
-            value=told,
+            value=stated,
         )
 
     def _required(self, field: str) -> str:

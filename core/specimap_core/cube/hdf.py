@@ -17,7 +17,7 @@ from specimap_core.cube.discover import Variable, choose_cube, choose_wavelength
 from specimap_core.cube.hdf_guard import as_text, guarded_dataset, open_guarded
 from specimap_core.cube.model import Cube, describe
 from specimap_core.cube.pixels import ArrayPixels, Pixels
-from specimap_core.cube.printable import shown
+from specimap_core.cube.printable import printable
 from specimap_core.cube.strided import native
 from specimap_core.cube.unpacked import scratch_array
 from specimap_core.errors import CubeContentError, CubeTruncatedError
@@ -227,7 +227,7 @@ class _ChunkedPixels(Pixels):
             return np.asarray(self._dataset[tuple(selection)]).transpose(self._axes)
         except OSError as error:
             raise CubeContentError(
-                f"'{shown(as_text(self._dataset.name))}' does not decode: {error}.",
+                f"'{printable(as_text(self._dataset.name))}' does not decode: {error}.",
                 advice="Save the cube again, uncompressed or with gzip.",
             ) from error
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from specimap_core.cube.declared_values import Declared
 from specimap_core.cube.pixels import Pixels, read_bip, workers
-from specimap_core.cube.values import Quantity, settle
+from specimap_core.cube.values import Quantity, interpret
 from specimap_core.cube.wavelengths import bad_band_mask, nanometres
 from specimap_core.errors import CubeHeaderError
 from specimap_core.geometry.cameras import Array, Floats
@@ -160,18 +160,18 @@ def describe(
     """
     wavelengths_nm, about_wavelengths = nanometres(wavelengths, units, pixels.shape[2])
     bad_bands, about_bands = bad_band_mask(bad_band_list, pixels.shape[2])
-    meaning = settle(path.name, pixels, bad_bands, declared or Declared())
+    values = interpret(path.name, pixels, bad_bands, declared or Declared())
     return Cube(
         path=path,
         format_name=format_name,
-        pixels=meaning.pixels,
+        pixels=values.pixels,
         files=files or (path,),
         wavelengths_nm=wavelengths_nm,
         bad_bands=bad_bands,
-        quantity=meaning.quantity,
-        to_reflectance=meaning.to_reflectance,
-        saturation=meaning.saturation,
-        warnings=warnings + about_wavelengths + about_bands + meaning.warnings,
+        quantity=values.quantity,
+        to_reflectance=values.to_reflectance,
+        saturation=values.saturation,
+        warnings=warnings + about_wavelengths + about_bands + values.warnings,
         exposure=None if declared is None else declared.exposure,
     )
 

@@ -14,7 +14,7 @@ from specimap_core.cube.declared_values import declared_of, is_word
 from specimap_core.cube.discover import Variable, arrays_beside, choose_cube, choose_wavelengths, cube_axes
 from specimap_core.cube.model import Cube, check_dtype, describe
 from specimap_core.cube.pixels import ArrayPixels
-from specimap_core.cube.printable import shown
+from specimap_core.cube.printable import printable
 from specimap_core.cube.unpacked import bytes_of, scratch_array
 from specimap_core.errors import CubeFormatError, CubeTruncatedError
 from specimap_core.geometry.cameras import Array, Floats
@@ -40,7 +40,7 @@ def refuse_dataset(path: Path, dataset: str | None) -> None:
     """Raises CubeFormatError where one is named in a file that holds a single array."""
     if dataset is not None:
         raise CubeFormatError(
-            f"{path.name} holds one cube, and no data sets with names such as '{shown(dataset)}'.",
+            f"{path.name} holds one cube, and no data sets with names such as '{printable(dataset)}'.",
             advice="Give the file alone, without '::'.",
         )
 

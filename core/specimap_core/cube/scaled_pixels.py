@@ -49,7 +49,7 @@ class Missing:
             np.copyto(out, np.nan, where=dead)
 
 
-class MeantPixels(Pixels):
+class ScaledPixels(Pixels):
     """Values as they are meant, floats. ``gains`` and ``offsets`` (bands,) or None; ``unsigned``: as in Declared."""
 
     def __init__(
@@ -63,11 +63,11 @@ class MeantPixels(Pixels):
         self._offsets = None if offsets is None else offsets.astype(self.dtype)
 
     def block(self, start: int, stop: int) -> Array:
-        return self._meant(to_bip(self._stored.block(start, stop)), self._missing.dead, self._gains, self._offsets)
+        return self._scaled(to_bip(self._stored.block(start, stop)), self._missing.dead, self._gains, self._offsets)
 
     def band(self, index: int) -> Array:
         dead = self._missing.dead
-        return self._meant(
+        return self._scaled(
             self._stored.band(index),
             None if dead is None else dead[:, index],
             None if self._gains is None else self._gains[index],
@@ -78,7 +78,7 @@ class MeantPixels(Pixels):
         # A quarter: stored values, masks and results of a strip are alive at once.
         return max(1, super().strip_rows() // 4)
 
-    def _meant(self, raw: Array, dead: NDArray[np.bool_] | None, gains: Array | None, offsets: Array | None) -> Array:
+    def _scaled(self, raw: Array, dead: NDArray[np.bool_] | None, gains: Array | None, offsets: Array | None) -> Array:
         raw = as_unsigned(raw) if self._unsigned else raw
         # What is too large for the type becomes infinite, which is no value either.
         with np.errstate(over="ignore", invalid="ignore"):

@@ -78,7 +78,7 @@ class TiffFormat:
         wavelengths, units = named_wavelengths(file)
         axes, about_axes = _axes(path, series, None if wavelengths is None else len(wavelengths))
         array = _values(path, file, series)
-        declared = declared_of(path.name, _said(file, array.shape[axes[2]] if len(axes) == 3 else 1))
+        declared = declared_of(path.name, _declared_attributes(file, array.shape[axes[2]] if len(axes) == 3 else 1))
         if len(axes) == 2:
             array, axes = array[..., None], (*axes, 2)
         return describe(
@@ -88,7 +88,7 @@ class TiffFormat:
             wavelengths=wavelengths,
             units=units,
             declared=declared,
-            warnings=packing + _about_others(file, series) + about_axes,
+            warnings=packing + _other_series(file, series) + about_axes,
         )
 
 
@@ -102,7 +102,7 @@ def _largest(file: tifffile.TiffFile) -> tifffile.TiffPageSeries:
     return max(file.series, key=lambda s: s.nbytes)
 
 
-def _about_others(file: tifffile.TiffFile, chosen: tifffile.TiffPageSeries) -> Notices:
+def _other_series(file: tifffile.TiffFile, chosen: tifffile.TiffPageSeries) -> Notices:
     others = [s for s in file.series if s is not chosen and s.ndim >= 3 and s.nbytes * 2 > chosen.nbytes]
     if not others:
         return ()
@@ -200,7 +200,7 @@ def _values(path: Path, file: tifffile.TiffFile, series: tifffile.TiffPageSeries
     return out
 
 
-def _said(file: tifffile.TiffFile, bands: int) -> dict[str, object]:
+def _declared_attributes(file: tifffile.TiffFile, bands: int) -> dict[str, object]:
     """What GDAL's tags and the JSON description that tifffile writes say of the values."""
     said: dict[str, object] = {}
     for described in file.shaped_metadata or ():

@@ -41,7 +41,7 @@ def nanometres(values: Floats | None, units: str | None, bands: int) -> tuple[Fl
     nm, warnings = _scaled(values, unit)
     if nm is None:
         return unknown, warnings
-    return nm, warnings + _about_order(nm)
+    return nm, warnings + _order_warnings(nm)
 
 
 def _are_band_numbers(values: Floats, unit: Unit) -> bool:
@@ -104,7 +104,7 @@ def _plausible(nm: Floats) -> bool:
     return bool(np.round(nm.min(), 6) >= _SHORTEST_NM and np.round(nm.max(), 6) <= _LONGEST_NM)
 
 
-def _about_order(nm: Floats) -> Notices:
+def _order_warnings(nm: Floats) -> Notices:
     steps = np.diff(nm)
     if (steps > 0).all() or (steps < 0).all():
         return ()

@@ -109,7 +109,7 @@ def _poses(poses: tuple[Pose, ...]) -> np.ndarray[Any, Any]:
     return np.stack([p.matrix[:3] for p in poses])
 
 
-def _unposes(matrices: np.ndarray[Any, Any]) -> tuple[Pose, ...]:
+def _poses_of(matrices: np.ndarray[Any, Any]) -> tuple[Pose, ...]:
     return tuple(Pose(m[:, :3].copy(), m[:, 3].copy()) for m in matrices)
 
 
@@ -166,7 +166,7 @@ def load_stage1(store: Store, key: str, *, with_depth: bool = True) -> Stage1 | 
     reconstruction = Reconstruction(
         tuple(meta["photos"]),
         Intrinsics(**meta["lens"]),
-        _unposes(arrays["poses"]),
+        _poses_of(arrays["poses"]),
         tuple(maps),
         arrays["points"],
         tuple(Refusal(**x) for x in meta["refused_later"]),
@@ -216,7 +216,7 @@ def load_stage2(store: Store, key: str) -> Stage2 | None:
     x, meta = found
     adjusted = Adjusted(
         Intrinsics(**meta["lens"]),
-        _unposes(x["poses"]),
+        _poses_of(x["poses"]),
         tuple(meta["marker_ids"]),
         x["corners"],
         x["covariance"],

@@ -10,7 +10,7 @@ import numpy as np
 from specimap_core.atomic import write_text
 from specimap_core.cloud import Cloud
 from specimap_core.cloud.preview import write_preview
-from specimap_core.cloud.write_summary import Written
+from specimap_core.cloud.write_summary import WriteSummary
 from specimap_core.cloud.writer import write_cloud
 from specimap_core.cube import Cube
 from specimap_core.errors import MarkersMissingInCubeError
@@ -64,7 +64,7 @@ def register_stage(
         run = RunRecord(settings, given.hashes, clock.seconds, clock.reused, given.warnings)
         report = gated(build_report(stage1, adjusted, registered, run), settings.adjust.edge_mm)
 
-        def attributes(written: Written) -> dict[str, object]:
+        def attributes(written: WriteSummary) -> dict[str, object]:
             nonlocal report
             report = report.model_copy(update={"warnings": [*report.warnings, *written.warnings()]})
             return {"report": report.summary(), "settings": settings.as_dict(), "inputs": dict(given.hashes)}

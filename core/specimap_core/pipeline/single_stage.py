@@ -12,7 +12,7 @@ from specimap_core.notices import Notices
 from specimap_core.photos.folder import photo_paths
 from specimap_core.pipeline.artefacts import Stage1, Stage2, load_stage1, load_stage2
 from specimap_core.pipeline.clock import Clock, Progress
-from specimap_core.pipeline.failures import told_as_stage_failure
+from specimap_core.pipeline.failures import as_stage_failure
 from specimap_core.pipeline.outputs import Inputs, Outputs, prepare_folder
 from specimap_core.pipeline.settings import PipelineSettings
 
@@ -47,7 +47,7 @@ def run_stage(run: StageRun, *, progress: Progress, cancelled: Callable[[], bool
     prepare_folder(run.out)
     clock = Clock(progress, cancelled, seconds=run.seconds, reused=run.reused)
     stages = {"reconstruct": _reconstruct, "adjust": _adjust, "render": _render, "register": _register}
-    with told_as_stage_failure(run.stage):
+    with as_stage_failure(run.stage):
         stages[run.stage](run, clock)
     return clock.seconds[run.stage]
 

@@ -32,7 +32,7 @@ from specimap_core.reconstruct.backend import ReconstructionBackend, corners_in_
 from specimap_core.reconstruct.backends.requirements import check_required
 from specimap_core.reconstruct.dense.depth_map import DepthMap
 from specimap_core.reconstruct.dense.volume import volume_over
-from specimap_core.reconstruct.focal_breathing import settle_breathing
+from specimap_core.reconstruct.focal_breathing import correct_focal_breathing
 from specimap_core.reconstruct.photo_resolution import at_own_resolution
 from specimap_core.render.orthographic import Grid, extent_of, render_grid
 from specimap_core.surface.fusion import fuse
@@ -88,7 +88,7 @@ def reconstruct_stage(
         )
         photos, detections = at_own_resolution(photos, detections, workers=workers)
         corners = corners_in_photos(photos, detections, settings.reconstruct.dictionary)
-        photos, corners, zooms = settle_breathing(
+        photos, corners, zooms = correct_focal_breathing(
             photos, corners, edge_mm=settings.adjust.edge_mm, focal_px=stated_focal_px(photos), workers=workers
         )
         if corners.solution is not None:

@@ -99,7 +99,7 @@ def register_cube(
         surface.sigma_mm.astype(np.float32),
         adjusted.corners,
         float(np.median(adjusted.sigma_corner_mm)),
-        refined.sideways_mm,
+        refined.lateral_sd_mm,
         camera.pixel_mm,
         None if by_camera else parallax_mm,
     )

@@ -99,7 +99,7 @@ def _figures(report: Report) -> Iterator[Block]:
     rows = (
         ("2D corner error, mean ± sd", *map(_corner_2d, methods), published.CORNER_2D_WORDS),
         ("3D corner error, median (quartiles)", *map(_corner_3d, methods), published.CORNER_3D_WORDS),
-        ("Leaving a marker out, median (largest)", *(_left(m.leave_one_marker_out_mm) for m in methods), "–"),
+        ("Leaving a marker out, median (largest)", *(_leave_one_out(m.leave_one_marker_out_mm) for m in methods), "–"),
         (f"Marker edge, mean ± sd (known: {edge.expected:g})", f"{mm(edge.mean)} ± {mm(edge.std)}", *rest[1:]),
         ("Between the two methods, median (largest)", f"{mm(parallax.median)} ({mm(parallax.maximum)})", *rest[1:]),
         ("Stated sigma of the specimen, median (95 %)", f"{mm(sigma.median)} ({mm(sigma.p95)})", *rest[1:]),
@@ -125,7 +125,7 @@ def _corner_3d(figures: MethodFigures) -> str:
     return f"{mm(found.median)} ({mm(found.q1)}, {mm(found.q3)})"
 
 
-def _left(figures: LeaveOneOut | None) -> str:
+def _leave_one_out(figures: LeaveOneOut | None) -> str:
     return "–" if figures is None else f"{mm(figures.median)} ({mm(figures.maximum)})"
 
 

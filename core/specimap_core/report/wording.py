@@ -225,7 +225,7 @@ def verdict(report: Report) -> Verdict:
     """Whether the result holds what can be expected of it, and what to do where it does not."""
     failed = [check for check in checks(report) if not check.good]
     grave = [w for w in report.warnings if w.code in GRAVE]
-    sentences = [placed(report), used(report), *(w.message for w in grave)]
+    sentences = [placement_sentence(report), photos_sentence(report), *(w.message for w in grave)]
     level: Level = "attention"
     if grave:
         title = "Look before use: all places are in doubt."
@@ -239,7 +239,7 @@ def verdict(report: Report) -> Verdict:
     return Verdict(level, title, tuple(sentences), tuple(actions))
 
 
-def placed(report: Report) -> str:
+def placement_sentence(report: Report) -> str:
     """How sure the places are."""
     middle, most = report.sigma_mm.median, report.sigma_mm.p95
     if not (math.isfinite(middle) and math.isfinite(most)):
@@ -250,7 +250,7 @@ def placed(report: Report) -> str:
     )
 
 
-def used(report: Report) -> str:
+def photos_sentence(report: Report) -> str:
     """How many photos were used, and why not all."""
     given, count = report.photos.given, len(report.photos.used)
     if not given - count:

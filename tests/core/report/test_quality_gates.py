@@ -13,7 +13,7 @@ import pytest
 from specimap_core.errors import RegistrationError, ResultInsufficientError
 from specimap_core.geometry.cameras import look_at
 from specimap_core.reconstruct.backend import CornersInPhotos
-from specimap_core.reconstruct.pose_check import strays
+from specimap_core.reconstruct.pose_check import outlier_photos
 from specimap_core.report.model import PhotoCorners, Report
 from specimap_core.report.quality_gates import gated, outlying_photos
 from specimap_core.report.wording import GRAVE, WARNING_ADVICE, checks, verdict
@@ -146,12 +146,12 @@ def test_photos_tens_of_pixels_off_are_strays(moved: dict[int, float]) -> None:
     for k, mm in moved.items():
         aside = np.array([mm, 0.0, 0.0])
         poses[k] = look_at(poses[k].centre + aside, aside, np.array([0.0, 0, 1]))
-    found = strays(truth.lens, poses, CornersInPhotos(seen, (0, 1, 2, 3)))
+    found = outlier_photos(truth.lens, poses, CornersInPhotos(seen, (0, 1, 2, 3)))
     assert set(found) == set(moved)
     assert all(20 < px < 400 for px in found.values())
     # Photos that show no marker are not judged.
     blind = CornersInPhotos(seen.of(~np.isin(seen.photo, list(moved))), (0, 1, 2, 3))
-    assert strays(truth.lens, poses, blind) == {}
+    assert outlier_photos(truth.lens, poses, blind) == {}
 
 
 # ---- whole runs -----------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import pytest
 
 from specimap_core.notices import Notice
 from specimap_core.report.model import Refused, SigmaFigures
-from specimap_core.report.wording import REFUSAL_ADVICE, checks, placed, verdict
+from specimap_core.report.wording import REFUSAL_ADVICE, checks, placement_sentence, verdict
 from tests.support.document_scene import full_report
 from tests.support.error_tables import table_of
 
@@ -49,4 +49,4 @@ def test_verdicts() -> None:
 )
 def test_how_places_are_put_in_words(median: float, said: str) -> None:
     report = full_report(10).model_copy(update={"sigma_mm": SigmaFigures(median=median, p95=2 * median)})
-    assert said in placed(report)
+    assert said in placement_sentence(report)

@@ -16,7 +16,7 @@ SEEN_BEHIND = 4.0
 """A depth this many tolerances behind the other photo's is hidden there: that photo has no say."""
 
 
-def sights(poses: Sequence[Pose], target: Floats) -> Floats:
+def viewing_directions(poses: Sequence[Pose], target: Floats) -> Floats:
     """Unit directions (N, 3) from ``target`` to the cameras."""
     away = np.stack([p.centre for p in poses]) - target
     return np.asarray(away / np.linalg.norm(away, axis=1, keepdims=True))
@@ -24,7 +24,7 @@ def sights(poses: Sequence[Pose], target: Floats) -> Floats:
 
 def nearest_photos(poses: Sequence[Pose], target: Floats, count: int) -> list[list[int]]:
     """For each photo the ``count`` others that look at ``target`` from the nearest directions."""
-    towards = sights(poses, target)
+    towards = viewing_directions(poses, target)
     order = np.argsort(-(towards @ towards.T), axis=1)
     return [[int(j) for j in row if j != i][:count] for i, row in enumerate(order)]
 

@@ -21,7 +21,7 @@ from specimap_core.reconstruct.backend import (
 )
 from specimap_core.reconstruct.backends.da3.known_depths import placed_features
 from specimap_core.reconstruct.backends.da3.prepare import conditioning, plan_preparation, windows
-from specimap_core.reconstruct.backends.da3.residual_field import bend
+from specimap_core.reconstruct.backends.da3.residual_field import correct_residuals
 from specimap_core.reconstruct.backends.da3.settings import NAME, PREFIX, Da3Settings, settings_from_environment
 from specimap_core.reconstruct.backends.depth_alignment import LARGEST_SCATTER, align, depths_at, on_markers
 from specimap_core.reconstruct.backends.network_warnings import backend_run, depth_unaligned
@@ -164,7 +164,7 @@ def in_millimetres(points: Floats, view: View, network: Singles, seed: int) -> M
     fit = align(found, true, seed=seed)
     if fit is None:
         return None
-    depth, scatter = bend(fit.apply(network), at, true)
+    depth, scatter = correct_residuals(fit.apply(network), at, true)
     return Metric(depth, scatter) if np.isfinite(scatter) else None
 
 

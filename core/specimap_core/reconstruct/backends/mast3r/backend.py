@@ -21,7 +21,7 @@ from specimap_core.reconstruct.backend import (
     ReconstructSettings,
     sparse_points,
 )
-from specimap_core.reconstruct.backends.marker_alignment import place_by_markers
+from specimap_core.reconstruct.backends.marker_alignment import align_to_markers
 from specimap_core.reconstruct.backends.mast3r.images import Preparation, plan_preparation
 from specimap_core.reconstruct.backends.mast3r.maps import depth_maps
 from specimap_core.reconstruct.backends.mast3r.metric import Predicted, as_predicted, hold_to_markers, network_lens
@@ -98,7 +98,7 @@ class Mast3rBackend:
         )
         lens, poses = cameras_of(answer, plan)
         predicted = predicted_by(answer)
-        placed = place_by_markers(lens, poses, corners, [p.name for p in photos], settings.edge_mm)
+        placed = align_to_markers(lens, poses, corners, [p.name for p in photos], settings.edge_mm)
         metric = (
             hold_to_markers(
                 lens, placed, corners, predicted, plan, chosen.confidence, edge_mm=settings.edge_mm, seed=settings.seed

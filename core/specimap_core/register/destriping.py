@@ -9,14 +9,14 @@ from scipy.ndimage import median_filter
 from specimap_core.geometry.robust import SIGMA_OF_MAD
 
 WIDEST_PX = 9
-"""Widest stripe that is told from what the image shows."""
+"""Widest stripe that is distinguished from what the image shows."""
 UNLIKE = 3.0
 """A line is a stripe where most of it differs from its surroundings by so many usual differences, to one side."""
 MOST = 0.6
 """How much of it must: on phantoms no line differs so over more than 0.17 of its length, dead ones over all of it."""
 
 
-def without_stripes(image: NDArray[np.float32]) -> NDArray[np.float32]:
+def destriped(image: NDArray[np.float32]) -> NDArray[np.float32]:
     """The image (rows, cols) with what lies on stripes interpolated from beside them."""
     filled = _without_columns(np.asarray(image, np.float32))
     return np.ascontiguousarray(_without_columns(filled.T).T)
