@@ -15,7 +15,7 @@ TILE = 16
 CHUNK_POINTS = 256
 SHARD_POINTS = 131072
 SCALE_FACTOR = 1e-4
-"""Stored value times this is reflectance, where nothing else is said."""
+"""Stored value times this is reflectance, where nothing else is stated."""
 NO_VALUE = 65535
 """Stored where there is no value, in clouds whose ``spectra`` have the attribute ``_FillValue``."""
 

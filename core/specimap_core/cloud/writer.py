@@ -45,7 +45,7 @@ def write_cloud(
     too. What is no finite number is stored as ``_FillValue``; its point is flagged NO_DATA if the band is good. Few
     values far beyond all others are clipped and counted.
 
-    ``attributes`` go to the group, beside version, frame, units and bad bands; they may depend on what was found.
+    ``attributes`` go to the group, besides version, frame, units and bad bands; they may depend on what was found.
     ``saturation``: the value from which a band counts as saturated (default: the source's). ``progress`` hears
     fractions up to 1. ``durable`` waits until the disk has it all, which can double the time.
 

@@ -65,7 +65,7 @@ _SEPARATORS = re.compile(r"[\s,{}\[\]()]+")
 class Declared:
     """What a file says of its values.
 
-    ``no_data``: stored values that stand for none, beside NaN. ``valid``: stored values outside of these two are
+    ``no_data``: stored values that stand for none, besides NaN. ``valid``: stored values outside of these two are
     none. ``gains``, ``offsets`` (1,) or (B,): stored * gain + offset is the value; ``divisor``: the value by it is
     reflectance. ``names`` of the fields that gave them, for messages. ``ceiling``: the stored value at which the
     sensor clips. ``unsigned``: integers are to be read without sign. ``reflectance``: the file calls its values so.
@@ -150,7 +150,7 @@ def declared_of(
 
 
 def _other_quantity(titles: Sequence[str | None], description: str | None) -> str | None:
-    """What names or units call the values, where that is not reflectance; None where nothing is said."""
+    """What names or units call the values, where that is not reflectance; None where they state nothing."""
     for title in titles:
         if (found := _OTHER_QUANTITY.search(title or "")) is not None:
             return (found["name"] or "radiance").lower()

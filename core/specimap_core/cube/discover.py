@@ -162,14 +162,14 @@ def choose_wavelengths(variables: Sequence[Variable], cube: Variable) -> Variabl
     best = max(vectors, key=lambda v: (max(v.shape) in cube.shape, _groups_shared(v, cube)))
     if best.units is not None:
         return best
-    told = [
+    stated = [
         v
         for v in variables
         if v.text is not None
         and _UNITS_NAME.search(v.short_name)
         and (_WAVELENGTH_NAME.search(v.short_name) or read_unit(v.text).kind not in ("none", "unrecognised"))
     ]
-    nearest = max(told, key=lambda v: _groups_shared(v, best), default=None)
+    nearest = max(stated, key=lambda v: _groups_shared(v, best), default=None)
     return replace(best, units=nearest.text if nearest else _units_in_name(best.short_name))
 
 

@@ -60,8 +60,8 @@ def _declared(path: Path, name: str, attributes: Mapping[str, object]) -> Declar
 
 
 def _units(variable: object) -> str | None:
-    told = {name.lower(): value for name, value in vars(variable).items()}
-    units = told.get("units", told.get("unit"))
+    stated = {name.lower(): value for name, value in vars(variable).items()}
+    units = stated.get("units", stated.get("unit"))
     return units.decode("utf-8", "replace") if isinstance(units, bytes) else None
 
 

@@ -138,7 +138,7 @@ class NpzFormat:
                 values = np.array(_member(path, archive, wavelengths.name, headers), np.float64).ravel()
             array = _member(path, archive, cube.name, headers)
             small = [v for v in arrays_beside(variables, cube) if is_word(v.short_name, v.shape)]
-            said = {v.short_name: _member(path, archive, v.name, headers) for v in small}
+            stated = {v.short_name: _member(path, archive, v.name, headers) for v in small}
         axes, about_axes = cube_axes(cube, wavelengths, reversed_axes=False)
         if values is None:  # an archive follows .npy: rows x columns x bands, where nothing speaks against it
             about_axes = ()
@@ -148,7 +148,7 @@ class NpzFormat:
             ArrayPixels(array.transpose(axes)),
             wavelengths=values,
             units=wavelengths.units if wavelengths else None,
-            declared=declared_of(path.name, said, cube.name),
+            declared=declared_of(path.name, stated, cube.name),
             warnings=about_choice + about_axes,
         )
 

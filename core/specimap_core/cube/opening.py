@@ -92,7 +92,7 @@ def _open(given: Path) -> tuple[Cube, str | None]:
 
 
 def _check_file(path: Path) -> None:
-    """What can be said before the content is looked at."""
+    """Refuse what needs no look at the content."""
     try:
         there = path.exists()
     except PermissionError:

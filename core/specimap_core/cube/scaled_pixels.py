@@ -1,4 +1,4 @@
-"""Stored values of a cube as what they mean: no-data as NaN, gains and offsets applied."""
+"""Scale the stored values of a cube: gains and offsets applied, no-data as NaN."""
 
 from __future__ import annotations
 
@@ -50,7 +50,10 @@ class Missing:
 
 
 class ScaledPixels(Pixels):
-    """Values as they are meant, floats. ``gains`` and ``offsets`` (bands,) or None; ``unsigned``: as in Declared."""
+    """Floats with gains and offsets applied and no-data as NaN.
+
+    ``gains`` and ``offsets`` (bands,) or None; ``unsigned``: as in Declared.
+    """
 
     def __init__(
         self, stored: Pixels, missing: Missing, gains: Floats | None, offsets: Floats | None, *, unsigned: bool = False

@@ -202,12 +202,12 @@ def _values(path: Path, file: tifffile.TiffFile, series: tifffile.TiffPageSeries
 
 def _declared_attributes(file: tifffile.TiffFile, bands: int) -> dict[str, object]:
     """What GDAL's tags and the JSON description that tifffile writes say of the values."""
-    said: dict[str, object] = {}
+    stated: dict[str, object] = {}
     for described in file.shaped_metadata or ():
-        said |= {name: value for name, value in described.items() if plain(name) in WORDS}
+        stated |= {name: value for name, value in described.items() if plain(name) in WORDS}
     tags = file.pages.first.tags
     if _GDAL_NODATA in tags:
-        said["nodata"] = str(tags[_GDAL_NODATA].value)
+        stated["nodata"] = str(tags[_GDAL_NODATA].value)
     if _GDAL_METADATA in tags:
         text = str(tags[_GDAL_METADATA].value)
         for role, name, usual in (("scale", _GAINS, "1"), ("offset", _OFFSETS, "0")):
@@ -216,5 +216,5 @@ def _declared_attributes(file: tifffile.TiffFile, bands: int) -> dict[str, objec
                 sample = int(found[1])
                 if f'role="{role}"' in found[0] and sample < bands:
                     numbers[sample] = found[2]
-            said[name] = " ".join(numbers)
-    return said
+            stated[name] = " ".join(numbers)
+    return stated

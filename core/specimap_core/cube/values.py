@@ -1,7 +1,7 @@
-"""What a value of a cube means, decided here for all formats: no-data, gains, reflectance, where the sensor clips.
+"""Interpret the values of a cube, for all formats: no-data, gains, reflectance, where the sensor clips.
 
-A file's own words come first; a sample of rows then tells where they are missing, contradict each other, or make no
-sense. What has no value is NaN from here on, for markers, references, clouds and pictures alike.
+A file's own statements come first; a sample of rows then shows where they are missing, contradict each other, or make
+no sense. What has no value is NaN from here on, for markers, references, clouds and pictures alike.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class InterpretedValues:
 
 
 def interpret(file_name: str, stored: Pixels, bad_bands: NDArray[np.bool_], declared: Declared) -> InterpretedValues:
-    """What the stored values mean. Raises CubeHeaderError for gains or offsets that do not fit the bands."""
+    """Interpret the stored values. Raises CubeHeaderError for gains or offsets that do not fit the bands."""
     bands = stored.shape[2]
     check_counts(file_name, declared, bands)
     gains = _per_band(declared.gains, bands, idle=1.0)
@@ -243,5 +243,5 @@ def _saturation(level: float | None, gains: Floats | None, offsets: Floats | Non
     top = np.multiply(dtype.type(level), gain.astype(dtype), dtype=dtype)
     if offsets is not None:
         top = top + offsets.astype(dtype)
-    # With a negative gain the brightest is the smallest: it cannot be told by "at least".
+    # With a negative gain the brightest is the smallest: no "at least" finds it.
     return np.where(gain > 0, top, np.nan).astype(np.float64)

@@ -1,4 +1,4 @@
-"""Wavelengths in whatever unit a file gives them, in nanometres; or unknown, with a word about why."""
+"""Convert wavelengths to nanometres from whatever unit a file gives; unknown ones stay so, with a warning."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def _guessed(values: Floats) -> tuple[Floats, str] | None:
 
 
 def _plausible(nm: Floats) -> bool:
-    # Rounded, for bounds must not hang on the last digit of a conversion.
+    # Rounded: bounds must not depend on the last digit of a conversion.
     return bool(np.round(nm.min(), 6) >= _SHORTEST_NM and np.round(nm.max(), 6) <= _LONGEST_NM)
 
 

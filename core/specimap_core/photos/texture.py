@@ -100,6 +100,6 @@ def usual_share(photos: Iterable[tuple[Photo, Mask | None]]) -> float:
 
 
 def in_words(share: float, region: str) -> str:
-    """What a remark says of a share of ``region``."""
+    """Describe a share of ``region`` for a warning."""
     how = "much" if share >= MUCH else "some" if share >= SOME else "little"
     return f"{100 * share:.0f} % of {region} shows fine texture above the noise: {how}."

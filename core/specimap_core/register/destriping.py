@@ -17,7 +17,7 @@ MOST = 0.6
 
 
 def destriped(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The image (rows, cols) with what lies on stripes interpolated from beside them."""
+    """The image (rows, cols) with what lies on stripes interpolated from their surroundings."""
     filled = _without_columns(np.asarray(image, np.float32))
     return np.ascontiguousarray(_without_columns(filled.T).T)
 
@@ -30,7 +30,7 @@ def _without_columns(image: NDArray[np.float32]) -> NDArray[np.float32]:
     middle = np.float32(np.median(image[finite])) if finite.any() else np.float32(0)
     known = np.where(finite, image, middle)
     off = known - median_filter(known, (1, 2 * WIDEST_PX + 1), mode="mirror")
-    # What is usual stands beside the place itself: a bright part of the scene varies more than a dark one.
+    # What is usual is measured around the place itself: a bright part of the scene varies more than a dark one.
     usual = SIGMA_OF_MAD * np.median(np.abs(off), axis=1, keepdims=True) + 1e-6 * (np.abs(middle) + 1e-6)
     share = np.maximum((off > UNLIKE * usual).mean(0), (off < -UNLIKE * usual).mean(0))
     bad = (share > MOST) | (~finite).all(0)

@@ -61,7 +61,7 @@ def cube_frame(cloud: Cloud, shape: tuple[int, int]) -> CubeFrame:
 
 
 def spacing_mm(cloud: Cloud) -> float:
-    """Distance in the marker plane of what neighbouring pixels of the cube show, mm; NaN where it cannot be told."""
+    """Distance in the marker plane of what neighbouring pixels of the cube show, mm; NaN with too few points."""
     low = np.flatnonzero((cloud.flags & Flag.SPECIMEN) == 0)
     points = low if len(low) >= 3 else np.arange(cloud.n_points)
     points = points[:: max(1, len(points) // _FITTED_POINTS)]

@@ -35,7 +35,7 @@ NORMAL_WITHIN = ((1.0, 0.683), (2.0, 0.954), (3.0, 0.997))
 
 
 def on_specimen(cloud: Cloud) -> NDArray[np.bool_]:
-    """Points (S,) of the specimen; all of them where none is said to be."""
+    """Points (S,) of the specimen; all of them where none is flagged so."""
     found = (cloud.flags & Flag.SPECIMEN) > 0
     return found if found.any() else np.ones(cloud.n_points, bool)
 
@@ -78,7 +78,7 @@ def draw_flags(cloud: Cloud, frame: CubeFrame) -> Figure:
 
 
 def draw_above(above: TopRaster, preview: Bytes | None) -> Figure:
-    """The photos' colours on the surface, and beside them the first three principal components of the spectra."""
+    """The photos' colours on the surface, and next to them the first three principal components of the spectra."""
     wide = p.WIDTH_IN / (2 if preview is not None else 1.6)
     figure = p.figure(p.WIDTH_IN if preview is not None else wide, wide * _ratio(above) + 0.35)
     panels = figure.subplots(1, 2 if preview is not None else 1, squeeze=False)[0]

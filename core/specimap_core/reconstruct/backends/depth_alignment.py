@@ -33,7 +33,7 @@ LEAST_EXPLAINED = 0.5
 SHIFT_GAIN = 0.8
 """A shift must bring the scatter below this share of what the scale alone leaves."""
 SHIFT_SPREAD = 0.05
-"""Known depths must differ by this share of their middle for a shift to be told from a scale."""
+"""Known depths must differ by this share of their middle for a shift to be distinguished from a scale."""
 ROUNDS = 20
 TUKEY = 4.685
 LEAST_SIGMA = 1e-4

@@ -56,7 +56,7 @@ def backend_found(
 
 
 def backend_identity(name: str, environment: Mapping[str, str] = os.environ) -> dict[str, object] | None:
-    """What a result of the backend depends on beside a run's own settings: its variables, and the weights' sha256.
+    """What a result of the backend depends on besides a run's own settings: its variables, and the weights' sha256.
 
     None for a backend that has neither. Raises as :func:`backend_found` does.
     """

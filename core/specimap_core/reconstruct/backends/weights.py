@@ -1,4 +1,4 @@
-"""Weights files: given by path, told apart by their sha256, held to the one that the user pins."""
+"""Weights files: given by path, identified by their sha256, checked against the one that the user pins."""
 
 from __future__ import annotations
 
@@ -111,8 +111,8 @@ def _note(path: str, size: int, mtime_ns: int) -> Path | None:
         folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     except RuntimeError:
         return None
-    told = hashlib.sha256(f"{path}\n{size}\n{mtime_ns}".encode(errors="surrogateescape")).hexdigest()
-    return folder / "specimap" / "weights" / told[:32]
+    key = hashlib.sha256(f"{path}\n{size}\n{mtime_ns}".encode(errors="surrogateescape")).hexdigest()
+    return folder / "specimap" / "weights" / key[:32]
 
 
 def _is_sha256(text: str) -> bool:

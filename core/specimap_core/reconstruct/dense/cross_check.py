@@ -46,7 +46,7 @@ def confirmed(
 
 
 def share_confirmed(seen: Bytes, agreed: Bytes) -> Floats:
-    """The share, above 0 and up to 1, of those who see a depth that confirm it; 1 where none sees it."""
+    """The share, above 0 and up to 1, of the photos seeing a depth that confirm it; 1 where none sees it."""
     return np.asarray((1.0 + agreed) / (1.0 + np.maximum(seen, agreed)))
 
 
