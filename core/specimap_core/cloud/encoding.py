@@ -1,4 +1,4 @@
-"""How values of a cube become the 16-bit values of a cloud, and which of them are saturated, missing or clipped."""
+"""Encode values of a cube as the 16-bit values of a cloud, and flag the saturated, missing and clipped ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which pixels lie inside a polygon: even-odd rule, many pixels and edges at once."""
+"""Find the pixels inside a polygon: even-odd rule, many pixels and edges at once."""
 
 from __future__ import annotations
 

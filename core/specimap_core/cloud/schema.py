@@ -1,4 +1,4 @@
-"""What a spectral cloud holds: its flags, its arrays, their layout and the order of its points."""
+"""Schema of a spectral cloud: its flags, its arrays, their layout and the order of its points."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What was found in the spectra while a cloud was written."""
+"""Summary of the spectra of a written cloud."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a file says of its values, in whatever words its format has for it: one reading for all formats."""
+"""Read what a file declares of its values, in the words of any format."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which variable of a container (HDF5, NetCDF, MATLAB, .npz) is the cube, and which axis is which."""
+"""Find the cube among the variables of a container (HDF5, NetCDF, MATLAB, .npz), and the meaning of its axes."""
 
 from __future__ import annotations
 

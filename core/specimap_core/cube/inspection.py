@@ -1,4 +1,4 @@
-"""Is there anything usable in a cube? Cheap: a few sampled rows and the mean image, no second pass."""
+"""Inspect a cube for usable values. Cheap: a few sampled rows and the mean image, no second pass."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where software puts wavelengths into a TIFF: tifffile's JSON, GDAL's metadata, OME's channels, ENVI's own words."""
+"""Read the wavelengths of a TIFF: from tifffile's JSON, GDAL's metadata, OME's channels, ENVI's own words."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a folder of photos holds, by the ends of the names; what is passed over is named."""
+"""List the photos of a folder by the ends of their names; other files are named as passed over."""
 
 from __future__ import annotations
 

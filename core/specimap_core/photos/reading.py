@@ -1,4 +1,4 @@
-"""What was captured: photos, upright and at a working size, each judged as it is read."""
+"""Read photos, upright and at a working size; each is judged as it is read."""
 
 from __future__ import annotations
 

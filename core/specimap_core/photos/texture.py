@@ -1,4 +1,4 @@
-"""How much fine texture photos show where the specimen lies: what image features are found by.
+"""Measure how much fine texture photos show at the specimen, which image features need.
 
 The measure is the share of a region whose structure tensor (Foerstner 1987) has a smaller eigenvalue above the photo's
 noise: there the brightness changes in every direction, at the scale of a feature's inner detail. Coarse shading, edges

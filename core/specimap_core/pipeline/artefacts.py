@@ -1,4 +1,4 @@
-"""What a finished stage leaves on disk, keyed by a hash of everything that went into it."""
+"""Artefacts of finished stages on disk, keyed by a hash of everything that went into them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the marker corners were seen, and how far the adjusted ones project from there, for the report."""
+"""Marker corners as measured and their reprojection residuals, for the report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run reads and where its results lie; they appear together, once all are written."""
+"""Inputs and outputs of a run; the results appear together, once all are written."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Photos whose markers contradict the pose that they were given, as features may give one."""
+"""Find photos whose markers contradict their pose, as a pose by features may be wrong."""
 
 from __future__ import annotations
 

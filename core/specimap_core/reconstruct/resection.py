@@ -1,4 +1,4 @@
-"""Photos that markers do not reach: located by features against the photos that markers posed.
+"""Resection of photos without a pose, by features triangulated from the posed photos.
 
 Features are matched between neighbours in viewing angle, triangulated with the known poses, and a photo without a
 pose is then resected by LO-RANSAC (COLMAP). Each pair of photos is matched once.

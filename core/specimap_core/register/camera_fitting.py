@@ -22,7 +22,7 @@ from specimap_core.register.cube_camera import LEAST_SCATTER, CubeCamera, solve_
 from specimap_core.register.tile_offsets import TileOffsets
 
 MOTION_SCALES = np.array([0.1, 0.1, 0.01])
-"""What a shift in mm and a turn in rad usually change by."""
+"""Typical change of a shift in mm and a turn in rad."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class TileObservations:
 
 @dataclass(frozen=True)
 class CubeObservations:
-    """What is seen in the cube: ``corners`` (N, 3) mm at ``pixels`` (N, 2) with ``sigma_px`` (N,), and ``tiles``."""
+    """Observations in the cube: ``corners`` (N, 3) mm at ``pixels`` (N, 2) with ``sigma_px`` (N,), and ``tiles``."""
 
     corners: Floats
     pixels: Floats
@@ -100,7 +100,7 @@ class CameraFit:
 
 
 POSE_PARAMETERS = 6
-"""How many of a model's parameters are its pose."""
+"""Number of a model's parameters, from the first, that are its pose."""
 
 
 def refit(view: View, corners: Floats, pixels: Floats, sigma_px: Floats) -> View:

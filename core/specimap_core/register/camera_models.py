@@ -32,7 +32,7 @@ SKEW_SD = 0.05
 ASPECT_RANGE = (0.25, 4.0)
 """Heights over widths of a pixel that are believed."""
 MODEL_PENALTY = 8.0
-"""How much better than a frame camera of square pixels another must explain what is seen, in chi squared."""
+"""Chi squared that another model must gain over a frame camera of square pixels."""
 PARAMETERS = 10
 PARAMETER_SCALES = np.array([1e-3] * 3 + [1.0] * 3 + [0.1, 0.01, 0.01, 0.01])
 """Typical change of each parameter."""
@@ -107,7 +107,7 @@ def at_markers(view: View) -> View:
 
 
 def prior_residuals(view: View) -> list[float]:
-    """What ``view`` departs by from what is usual, in standard deviations."""
+    """Departures of ``view`` from what is usual, in standard deviations."""
     lens, pose = view.intrinsics, view.cam_from_world
     usual = float(np.sqrt(FOCAL_RANGE[0] * FOCAL_RANGE[1])) * max(lens.width, lens.height)
     off = [float(np.log(lens.focal_px / usual)) / FOCAL_PRIOR_SD]

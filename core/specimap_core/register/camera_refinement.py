@@ -1,4 +1,4 @@
-"""The cube's camera from the markers, and from the specimen where they leave it open.
+"""Refine the cube's camera by the specimen where the markers leave it open.
 
 Sixteen nearly coplanar corners give the plane's place in the cube to a few hundredths of a pixel, but the direction
 of sight and the focal length only as far as perspective shows: at the height of a specimen that leaves 0.02 to 0.1 mm

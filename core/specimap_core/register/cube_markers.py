@@ -1,4 +1,4 @@
-"""Markers in the cube: in the band mean, else in bands where they show; mirrored cubes are recognised."""
+"""Find markers in the cube: in the band mean, else in bands where they show; mirrored cubes are recognised."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Dead and hot columns and lines of an image, which a detector's line or a lost exposure leaves."""
+"""Remove stripes from an image: dead and hot columns, and lines of a lost exposure."""
 
 from __future__ import annotations
 

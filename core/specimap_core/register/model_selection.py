@@ -32,16 +32,16 @@ from specimap_core.register.tile_offsets import TileOffsets
 FOCAL_START = 5.0
 """Of a scan's camera, in widths of the cube."""
 MOTION_PENALTY = 20.0
-"""How much better a specimen that moved must explain what is seen, in chi squared."""
+"""Chi squared that a specimen that moved must gain over one that stayed."""
 TILE_MM, LEAST_TILE_MM = 0.1, 0.03
 """Standard deviation of a tile's place at first, and the least that is believed."""
 SHARED_TILE_ERROR = 3.0
-"""How much less sure a tile is where a camera is measured by it than where kinds are compared: the surface is off by as
-much over several tiles alike, which their scatter does not show."""
+"""Factor on a tile's standard deviation where it measures a camera, not where models are compared: several tiles share
+an error of the surface, which their scatter does not show."""
 LEAST_TILES = 5
 ROUNDS = 3
 MISFIT_BETWEEN_CORNERS = 1.5
-"""How much farther off the cube is taken to be between markers than at them, where no camera fits."""
+"""Misfit between markers over that at them, where no camera fits."""
 MISFIT, MISFIT_MM = 3.0, 0.05
 """Corners that lie so much farther than they should from where the best camera sees them, and farther than this, fit
 no camera."""
@@ -153,7 +153,7 @@ def _starts(observed: CubeObservations, rows: int, cols: int, square: CubeCamera
 
 
 def _first_offsets(measure: MeasureOffsets, views: Sequence[View]) -> TileOffsets | None:
-    """What is found through the first of ``views`` that finds enough."""
+    """The offsets measured through the first of ``views`` that has enough of them."""
     for view in views:
         found = measure(view)
         if found is not None and (np.isfinite(found.offsets[:, 0]) & (found.weight > 0)).sum() >= LEAST_TILES:
@@ -164,7 +164,7 @@ def _first_offsets(measure: MeasureOffsets, views: Sequence[View]) -> TileOffset
 def _fit_all(
     views: dict[Model, View], observed: CubeObservations, seen: TileOffsets
 ) -> dict[tuple[Model, bool], CameraFit]:
-    """Every kind, with a specimen that stayed and with one that moved, fitted to corners and specimen."""
+    """Fit every model to corners and tiles, with a specimen that stayed and with one that moved."""
     sigma_mm, fits = TILE_MM, {}
     for _ in range(2):
         whole = replace(observed, tiles=TileObservations.of(seen, sigma_mm))
@@ -187,7 +187,7 @@ def _cheapest(fits: dict[tuple[Model, bool], CameraFit]) -> tuple[Model, bool]:
 
 
 def _ambiguity_mm(fits: dict[tuple[Model, bool], CameraFit], best: tuple[Model, bool], places: Floats) -> float:
-    """What the kinds that are not ruled out leave open of the specimen's place."""
+    """Lateral distance between where the models that are not ruled out put the specimen, root mean square."""
     if not len(places):
         return 0.0
     variance = 0.0

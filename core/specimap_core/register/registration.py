@@ -1,4 +1,4 @@
-"""Stage 4: a cube registered to the surface, by its solved camera or by the published homography."""
+"""Stage 4: register a cube to the surface, by its solved camera or by the published homography."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether the specimen lies in the cube where the photos saw it, judged by its texture and outline.
+"""Detect a motion of the specimen between photos and cube, by its texture and outline.
 
 The tiles of a :class:`~specimap_core.register.tile_offsets.TileOffsets` give a rigid motion in the image's plane, and
 their scatter its uncertainty.
@@ -21,8 +21,8 @@ LEAST_AGREE = 0.6
 LEAST_MARKERS = 4
 """Three nearly coplanar markers leave the cube's focal length open: raised tissue then seems to have moved."""
 SHARED_MM = 0.02
-"""What all tiles are off together, one sd: seen through the true camera, specimens that did not move show 0.00 to 0.01
-mm on own phantoms and 0.02 to 0.03 mm on path-traced ones."""
+"""Standard deviation of the error that all tiles share: seen through the true camera, specimens that did not move show
+0.00 to 0.01 mm on own phantoms and 0.02 to 0.03 mm on path-traced ones."""
 ALLOWED_MM = 0.3
 ALLOWED_SIGMA = 4.0
 

@@ -1,4 +1,4 @@
-"""What a document is made of, whether it becomes HTML or PDF. All text is plain: no markup, nothing escaped."""
+"""Building blocks of a document, for HTML and PDF alike. All text is plain: no markup, nothing escaped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a document is drawn from: the files of a finished run, and truth where there is some."""
+"""Inputs of a document: the files of a finished run, and truth where there is some."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a finished run's figures must hold before anyone relies on them: warnings, and a refusal where nothing is left.
+"""Quality gates on a finished run's figures: warnings, and a refusal where nothing usable is left.
 
 Limits were set between sets that are in order and broken ones. In order: the phantoms (corners 0.05 to 0.21 px RMS, the
 worst photo 0.53 px and 4 times the median, coverage above 99 %) and 42 real photos (0.49 px at 1280 px). Broken: a card

@@ -1,4 +1,4 @@
-"""What the figures mean in words: the verdict, the checks, and what to do about each warning and refused photo."""
+"""Words for the figures: the verdict, the checks, and advice on each warning and refused photo."""
 
 from __future__ import annotations
 

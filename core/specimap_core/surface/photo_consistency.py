@@ -1,4 +1,4 @@
-"""How well photos agree on a surface: which of them are compared at a vertex, and how alike its patches are in them."""
+"""Photo-consistency of a surface: the photos compared at each vertex, and how alike its patches are in them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a network's own frame and scale into the marker frame: by the corners that its cameras see."""
+"""Bring a network's cameras from their own frame and scale into the marker frame, by the corners that they see."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run asks for and this machine lacks, checked before any work."""
+"""Check before any work that this machine has what a run asks for."""
 
 from __future__ import annotations
 

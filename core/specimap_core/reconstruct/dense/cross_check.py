@@ -1,4 +1,4 @@
-"""How far the depth maps of different photos confirm each other."""
+"""Cross-check depth maps of different photos."""
 
 from __future__ import annotations
 

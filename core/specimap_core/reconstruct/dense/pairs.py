@@ -1,4 +1,4 @@
-"""Which pairs of photos depth is measured in."""
+"""Choose the pairs of photos for dense stereo."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What known places tell of a network's aligned depth beyond its scale: an error that changes slowly."""
+"""Correct a network's aligned depth by a smooth field of its residuals at known places."""
 
 from __future__ import annotations
 
