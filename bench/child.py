@@ -21,11 +21,12 @@ from specimap_core.pipeline.artefacts import load_stage1, load_stage2
 from specimap_core.pipeline.clock import Clock
 from specimap_core.pipeline.options import DEFAULTS, RunOptions
 from specimap_core.pipeline.outputs import Inputs, Outputs, prepare_folder
-from specimap_core.pipeline.register_stage import register_and_write
+from specimap_core.pipeline.register_stage import CubeInput, register_stage
 from specimap_core.pipeline.run import run_pipeline
 from specimap_core.pipeline.settings import PipelineSettings, settings_from
 from specimap_core.pipeline.stages import adjust_stage, reconstruct_stage, render_stage
 from specimap_core.reconstruct.dense.device import dense_device
+from specimap_core.register.registration import Surface
 from specimap_core.report.model import Report
 from specimap_core.surface.raycast import RayCaster
 
@@ -96,7 +97,8 @@ def _register(options: Namespace, steps: _Steps) -> dict[str, object]:
     cube = open_cube(options.cube)
     settings, outputs, caster = settings_of(options), Outputs(options.out), RayCaster(stage2.mesh)
     grids = render_stage(stage2, caster, settings, outputs.store, "bench", clock)
-    return _said(register_and_write(stage1, stage2, caster, grids, cube, settings, outputs, clock, [], {}))
+    surface = Surface(stage2.adjusted, stage2.sigma_mm, caster, *grids)
+    return _said(register_stage(stage1, surface, CubeInput(cube, (), {}), settings, outputs, clock))
 
 
 def parsed() -> Namespace:

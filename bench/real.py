@@ -13,7 +13,7 @@ from specimap_core.photos.folder import photo_paths
 from specimap_core.pipeline.clock import Clock
 from specimap_core.pipeline.options import RunOptions
 from specimap_core.pipeline.outputs import Outputs
-from specimap_core.pipeline.register_stage import triangulated_edges
+from specimap_core.pipeline.report_builder import triangulated_edges
 from specimap_core.pipeline.settings import settings_from
 from specimap_core.pipeline.stages import adjust_stage, reconstruct_stage
 from specimap_core.reconstruct.dense.device import dense_device

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from specimap_core.cube import open_cube
 from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, View, fit_similarity
 from specimap_core.pipeline.artefacts import Stage1, Stage2
-from specimap_core.pipeline.register_stage import corners_in_cube
 from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.reconstruct.dense.depth_map import DepthMap
-from specimap_core.register.accuracy import CornersInCube
-from specimap_core.register.camera_refinement import settle_camera
+from specimap_core.register.camera_refinement import refine_camera
+from specimap_core.register.corners import CornersInCube, corners_in_cube
 from specimap_core.register.cube_markers import find_markers
 from specimap_core.register.placement import Placement, place_by_camera
 from specimap_core.surface.raycast import RayCaster
@@ -24,7 +23,7 @@ from specimap_core.truth.truth_file import Truth
 
 
 class Scene:
-    """``settled``: the cube's camera as the run solves it; ``true_camera``: as it was, in the run's frame; ``ours``
+    """``refined``: the cube's camera as the run solves it; ``true_camera``: as it was, in the run's frame; ``ours``
     takes the truth's frame into the run's."""
 
     def __init__(self, folder: Path, truth: Truth, stage1: Stage1, stage2: Stage2, settings: PipelineSettings) -> None:
@@ -34,8 +33,8 @@ class Scene:
         found = find_markers(cube, settings.reconstruct.dictionary, stage2.adjusted.marker_ids)
         seen: CornersInCube = corners_in_cube(found, stage2.adjusted, cube.cols)
         self.caster = RayCaster(stage2.mesh)
-        self.settled = settle_camera(seen, found, cube.rows, cube.cols, self.caster, stage2.adjusted.corners)
-        self.camera = self.settled.camera.view
+        self.refined = refine_camera(seen, found, cube.rows, cube.cols, self.caster, stage2.adjusted.corners)
+        self.camera = self.refined.camera.view
         ids = list(truth.marker_ids)
         self.true_corners = truth.marker_corners[[ids.index(i) for i in stage2.adjusted.marker_ids]]
         _, R, t = fit_similarity(self.true_corners.reshape(-1, 3), stage2.adjusted.corners.reshape(-1, 3))

@@ -173,8 +173,8 @@ def specimen(folder: Path, scratch: Path) -> Specimen:
         placed.triangle[at],
         placed.barycentric[at],
         scene.caster.interpolate(bend_mm(refined.mesh)[:, None], placed.triangle[at], placed.barycentric[at]).ravel(),
-        step_height(placed.pixels, placed.xyz[:, 2], scene.settled.camera.pixel_mm)[at],
+        step_height(placed.pixels, placed.xyz[:, 2], scene.refined.camera.pixel_mm)[at],
         float(np.median(adjusted.sigma_corner_mm)),
-        scene.settled.sideways_mm,
+        scene.refined.lateral_sd_mm,
         errors,
     )

@@ -65,7 +65,7 @@ class Photos(Model):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Remark(Model):
+class Notice(Model):
     """Something that a reader of the result should know."""
 
     code: str
@@ -99,7 +99,7 @@ class Report(Model):
     photos: Photos
     coverage: Coverage
     seconds: dict[str, float]
-    warnings: tuple[Remark, ...]
+    warnings: tuple[Notice, ...]
 
     def __getitem__(self, section: str) -> Any:
         """A section as plain JSON values."""

@@ -1,4 +1,4 @@
-"""How well marker corners are known: the marginal covariance of the solver's answer."""
+"""Marginal covariance of the adjusted marker corners."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from specimap_core.geometry.cameras import Floats
 
 LEAST_DAMPING = 1e-12
-"""Added to the diagonal, so that an unknown that nothing tells stays where it is."""
+"""Added to the diagonal, so that an unknown that nothing determines stays where it is."""
 
 
 class Assembly:
@@ -30,13 +30,13 @@ class Assembly:
         return np.asarray(H, float), np.asarray(g, float)
 
 
-def damped_step(H: Floats, g: Floats, damping: float, apart: tuple[int, int, int]) -> Floats:
+def damped_step(H: Floats, g: Floats, damping: float, blocks: tuple[int, int, int]) -> Floats:
     """The step x (N,) with ``(H + damping diag(H)) x = -g``, for a symmetric H (N, N).
 
-    ``apart``: first unknown, number and size of the blocks that stand one after the other on the diagonal and that H
+    ``blocks``: first unknown, number and size of the blocks that stand one after the other on the diagonal and that H
     does not tie to each other. Raises LinAlgError where the equations have no solution.
     """
-    first, count, size = apart
+    first, count, size = blocks
     end = first + count * size
     inner, outer = np.arange(first, end), np.r_[:first, end : len(g)]
     diagonal = damping * np.diag(H) + LEAST_DAMPING

@@ -220,7 +220,7 @@ def _normal_equations(
     return H, g, cost, weights.mean(1)
 
 
-def _moved(poses: tuple[Pose, ...], steps: Floats) -> tuple[Pose, ...]:
+def _stepped(poses: tuple[Pose, ...], steps: Floats) -> tuple[Pose, ...]:
     """Poses turned from the left and shifted by ``steps`` (N, 6)."""
     u, _, vt = np.linalg.svd(rotation_from_vector(steps[:, :3]) @ np.stack([p.R for p in poses]))
     return tuple(Pose(R, p.t + t) for R, p, t in zip(u @ vt, poses, steps[:, 3:], strict=True))
@@ -238,9 +238,9 @@ def _apply(scene: MarkerScene, step: Floats, edge_mm: float, refine_lens: bool) 
             k2=lens.k2 + float(step[4]),
         )
     P = len(scene.poses)
-    poses = _moved(scene.poses, step[LENS : LENS + 6 * P].reshape(P, 6))
+    poses = _stepped(scene.poses, step[LENS : LENS + 6 * P].reshape(P, 6))
     rest = step[LENS + 6 * P :]
     if scene.squares is None:
         return MarkerScene(lens, poses, scene.corners + rest.reshape(-1, 4, 3), None)
-    squares = _moved(scene.squares, rest.reshape(-1, 6))
+    squares = _stepped(scene.squares, rest.reshape(-1, 6))
     return MarkerScene(lens, poses, corners_of(squares, edge_mm), squares)

@@ -1,4 +1,4 @@
-"""How values of a cube become the 16-bit values of a cloud, and which of them are saturated, missing or clipped."""
+"""Encode values of a cube as the 16-bit values of a cloud, and flag the saturated, missing and clipped ones."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ class Encoding:
 
 
 @dataclass
-class Tally:
+class EncodingCounts:
     """What was found while spectra were gathered: values of good bands that were clipped at either end, or left out."""
 
     below: int = 0
@@ -114,11 +114,11 @@ class Tally:
     absurd: int = 0
 
 
-class Gatherer:
+class SpectraEncoder:
     """Picks spectra from the values of some rows, encodes them and flags their points, while they are in cache."""
 
     def __init__(self, source: SpectraSource, encoding: Encoding, saturation: float | None) -> None:
-        self.tally = Tally()
+        self.counts = EncodingCounts()
         self._encoding = encoding
         self._cols = source.cols
         level = source.saturation if saturation is None else np.asarray(saturation, np.float64)
@@ -148,7 +148,7 @@ class Gatherer:
             if not self._copies:
                 work = self._work[: len(rows)]
                 if not self._encoding.scale(picked, work):
-                    self._settle(picked, work, found)
+                    self._clip_and_flag(picked, work, found)
                 np.copyto(target, work, casting="unsafe")
         return flags
 
@@ -160,7 +160,7 @@ class Gatherer:
         suspects = np.flatnonzero(picked[:, self._good[len(self._good) // 2]] == 0)
         return suspects[~picked[np.ix_(suspects, self._good)].any(1)]
 
-    def _settle(self, picked: Array, work: Array, flags: NDArray[np.uint8]) -> None:
+    def _clip_and_flag(self, picked: Array, work: Array, flags: NDArray[np.uint8]) -> None:
         """Bring into range what cannot be stored, and flag and count it where the band is good."""
         top = self._encoding.top
         missing, absurd = np.zeros((2, *picked.shape), bool)
@@ -172,9 +172,9 @@ class Gatherer:
         for run in self._runs:
             flags[missing[:, run].any(1)] |= np.uint8(Flag.NO_DATA)
             flags[above[:, run].any(1)] |= np.uint8(Flag.SATURATED)
-            self.tally.above += int(above[:, run].sum())
-            self.tally.below += int(below[:, run].sum())
-            self.tally.absurd += int(absurd[:, run].sum())
+            self.counts.above += int(above[:, run].sum())
+            self.counts.below += int(below[:, run].sum())
+            self.counts.absurd += int(absurd[:, run].sum())
         np.clip(work, 0, top, out=work)
         work[missing] = NO_VALUE
 

@@ -1,4 +1,4 @@
-"""Which pixels lie inside a polygon: even-odd rule, many pixels and edges at once."""
+"""Find the pixels inside a polygon: even-odd rule, many pixels and edges at once."""
 
 from __future__ import annotations
 
@@ -53,6 +53,6 @@ def _crossings(outline: NDArray[np.float64], rows: tuple[int, int], *, upper: bo
     row = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)
     (row_a, col_a), (row_b, col_b) = a[edge].T, b[edge].T
     col = col_a + (row - row_a) / (row_b - row_a) * (col_b - col_a)
-    # Rounded, so that a crossing computed to lie beside a centre that it meets does meet it.
+    # Rounded, so that a crossing computed to lie next to a centre that it meets does meet it.
     col = np.rint(np.clip(col, -1, _ROW_STEP / 2) * 2**17) / 2**17
     return np.sort(row * _ROW_STEP + col)

@@ -86,7 +86,7 @@ def sampled_spectra(cloud: Cloud) -> NDArray[np.uint16]:
     return spectra if unsound.all() else spectra[~unsound]
 
 
-def _mend(
+def _fill_missing(
     colours: NDArray[np.float32], spectra: NDArray[np.uint16], components: Components, fill_value: int
 ) -> NDArray[np.bool_]:
     """Give points without a value in some bands the colour of the others; whether each has enough of them."""
@@ -118,7 +118,7 @@ def write_preview(cloud: Cloud, path: Path, grid_mm: float = 0.1) -> None:
     for part, spectra in cloud.iter_chunks(_BLOCK):
         colours[part] = components.colours(spectra)
         if cloud.fill_value is not None:
-            shown[part] = _mend(colours[part], spectra, components, cloud.fill_value)
+            shown[part] = _fill_missing(colours[part], spectra, components, cloud.fill_value)
     np.clip(colours, 0, 1, out=colours)
     image = _picture(view, colours, shown)
     done, png = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA), [cv2.IMWRITE_PNG_COMPRESSION, 3])

@@ -1,4 +1,4 @@
-"""Which spectra are saturated, told from their values while these are in cache."""
+"""Find saturated spectra by their values while these are in cache."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a spectral cloud holds: its flags, its arrays, their layout and the order of its points."""
+"""Schema of a spectral cloud: its flags, its arrays, their layout and the order of its points."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ TILE = 16
 CHUNK_POINTS = 256
 SHARD_POINTS = 131072
 SCALE_FACTOR = 1e-4
-"""Stored value times this is reflectance, where nothing else is said."""
+"""Stored value times this is reflectance, where nothing else is stated."""
 NO_VALUE = 65535
 """Stored where there is no value, in clouds whose ``spectra`` have the attribute ``_FillValue``."""
 

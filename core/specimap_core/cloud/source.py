@@ -1,4 +1,4 @@
-"""Where the bytes of a stored cloud come from: a folder, or whatever else can read parts of named files."""
+"""Sources of the bytes of a stored cloud: a folder, or whatever else reads parts of named files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far the values of a cube reach, so that 16 bits hold them."""
+"""Measure the range of a cube's values, so that 16 bits hold them."""
 
 from __future__ import annotations
 

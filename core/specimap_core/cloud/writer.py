@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from specimap_core import __version__
 from specimap_core.atomic import atomic_path
-from specimap_core.cloud.encoding import Encoding, Gatherer, Tally, strips
+from specimap_core.cloud.encoding import Encoding, EncodingCounts, SpectraEncoder, strips
 from specimap_core.cloud.schema import ARRAYS, SHARD_POINTS, CloudPoints, Flag, SpectraSource, chunk_bounds, tile_order
-from specimap_core.cloud.write_summary import Written
+from specimap_core.cloud.write_summary import WriteSummary
 from specimap_core.errors import RegistrationError
 from specimap_core.geometry.cameras import Array
 from specimap_core.json_text import json_text
@@ -32,12 +32,12 @@ def write_cloud(
     path: Path,
     points: CloudPoints,
     source: SpectraSource,
-    attributes: Mapping[str, object] | Callable[[Written], Mapping[str, object]],
+    attributes: Mapping[str, object] | Callable[[WriteSummary], Mapping[str, object]],
     *,
     progress: Callable[[float], None] | None = None,
     saturation: float | None = None,
     durable: bool = False,
-) -> Written:
+) -> WriteSummary:
     """Write the cloud of ``points`` with the spectra of ``source`` to the group ``path``, replacing it.
 
     The points are brought to the order of 16x16 tiles. Reflectance is stored in steps of 1e-4, counts as they are where
@@ -45,7 +45,7 @@ def write_cloud(
     too. What is no finite number is stored as ``_FillValue``; its point is flagged NO_DATA if the band is good. Few
     values far beyond all others are clipped and counted.
 
-    ``attributes`` go to the group, beside version, frame, units and bad bands; they may depend on what was found.
+    ``attributes`` go to the group, besides version, frame, units and bad bands; they may depend on what was found.
     ``saturation``: the value from which a band counts as saturated (default: the source's). ``progress`` hears
     fractions up to 1. ``durable`` waits until the disk has it all, which can double the time.
 
@@ -59,7 +59,7 @@ def write_cloud(
     with atomic_path(path) as group, _storage_errors():
         group.mkdir()
         encoding = Encoding.of(source)
-        found, tally = _write_spectra(group, points, source, encoding, saturation, durable, progress)
+        found, counts = _write_spectra(group, points, source, encoding, saturation, durable, progress)
         flags = points.flags | found
         for name, values in vars(replace(points, flags=flags)).items():
             _write_array(group, name, values, durable)
@@ -72,7 +72,7 @@ def write_cloud(
             "bad_bands": np.flatnonzero(source.bad_bands),
             "cube_shape": (source.rows, source.cols, source.bands),
         }
-        written = _written(found, tally, encoding)
+        written = _written(found, counts, encoding)
         given = attributes(written) if callable(attributes) else attributes
         _write_group_metadata(group, own | dict(given))
     if progress:
@@ -80,14 +80,14 @@ def write_cloud(
     return written
 
 
-def _written(flags: NDArray[np.uint8], tally: Tally, encoding: Encoding) -> Written:
-    return Written(
+def _written(flags: NDArray[np.uint8], counts: EncodingCounts, encoding: Encoding) -> WriteSummary:
+    return WriteSummary(
         points=len(flags),
         saturated=int(((flags & Flag.SATURATED) > 0).sum()),
         no_data=int(((flags & Flag.NO_DATA) > 0).sum()),
-        clipped_below=tally.below,
-        clipped_above=tally.above,
-        absurd=tally.absurd,
+        clipped_below=counts.below,
+        clipped_above=counts.above,
+        absurd=counts.absurd,
         least=encoding.add_offset,
         largest=encoding.add_offset + encoding.top * encoding.scale_factor,
     )
@@ -123,20 +123,20 @@ def _write_spectra(
     saturation: float | None,
     durable: bool,
     progress: Callable[[float], None] | None,
-) -> tuple[NDArray[np.uint8], Tally]:
+) -> tuple[NDArray[np.uint8], EncodingCounts]:
     """Write the array ``spectra``; the flags (S,) that the spectra set, and what was clipped."""
     size = len(points)
-    gatherer = Gatherer(source, encoding, saturation)
+    encoder = SpectraEncoder(source, encoding, saturation)
     flags = np.empty(size, np.uint8)
     with _create(group, "spectra", (size, source.bands), encoding.attributes(), durable) as array:
         for raw, start, take in _strips_in_tile_order(points.hsi_pixel, source):
             stop = start + len(take)
             block = np.empty((len(take), source.bands), np.uint16)
-            flags[start:stop] = gatherer.gather(raw, take, block)
+            flags[start:stop] = encoder.gather(raw, take, block)
             array.write(start, block)
             if progress:
                 progress(0.95 * stop / size)
-    return flags, gatherer.tally
+    return flags, encoder.counts
 
 
 def _strips_in_tile_order(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,15 +17,16 @@ from specimap_core.cube.model import Cube
 from specimap_core.cube.pixels import Pixels
 from specimap_core.cube.strided import to_bip
 from specimap_core.cube.values import QUANTITY_OTHER, implausible, sampled
-from specimap_core.cube.wavelengths import Warnings
 from specimap_core.errors import CubeContentError
 from specimap_core.geometry.cameras import Array, Floats
+from specimap_core.notices import Notice, Notices
 
 # Fewer columns x bands of a saturated white than this are dead elements.
 _LEAST_CLIPPED_WHITE = 0.002
 # Wider apart than a band of any imager: the reference was taken with other settings.
 _WAVELENGTH_TOLERANCE_NM = 1.0
 _EXPOSURE_TOLERANCE = 0.01
+_WAVELENGTHS_DIFFER = {"white": "white_wavelengths_differ", "dark": "dark_wavelengths_differ"}
 # A spectrum of fewer bands may well be zero in all.
 _LEAST_BANDS = 3
 
@@ -36,15 +38,15 @@ def calibrated(raw: Cube, white: Cube, dark: Cube | None) -> Cube:
     reflectance is NaN. Saturation stays that of the raw counts. Raises CubeContentError for a reference whose columns
     or bands do not fit.
     """
-    warnings: Warnings = _fit(raw, white, "white") + (_fit(raw, dark, "dark") if dark else ())
+    warnings: Notices = _check_fit(raw, white, "white") + (_check_fit(raw, dark, "dark") if dark else ())
     scales, about_units = _to_common_units(raw, white, dark)
     warnings += about_units
     white_line = _mean_line(white)
-    warnings += _saturated(white, white_line)
+    warnings += _saturation_warning(white, white_line)
     white_line *= scales[0]
     dark_line = np.zeros_like(white_line) if dark is None else _mean_line(dark) * scales[1]
     if dark is None:
-        warnings += (("dark_missing", "No dark reference was given; a dark signal of zero is assumed."),)
+        warnings += (Notice("dark_missing", "No dark reference was given; a dark signal of zero is assumed."),)
     span = np.broadcast_to(white_line - dark_line, (raw.cols, raw.bands))
     usable = span > 0  # False for NaN, too
     if not usable.any():
@@ -55,7 +57,7 @@ def calibrated(raw: Cube, white: Cube, dark: Cube | None) -> Cube:
     if not usable.all():
         count = int(usable.size - usable.sum())
         text = f"At {count} of {usable.size} columns x bands the white is not brighter than the dark."
-        warnings += (("reference_invalid", f"{text} Reflectance is unknown (NaN) there."),)
+        warnings += (Notice("reference_invalid", f"{text} Reflectance is unknown (NaN) there."),)
     gain = np.full(span.shape, np.nan)
     np.divide(1.0, span, out=gain, where=usable)
     pixels = _CalibratedPixels(
@@ -63,7 +65,7 @@ def calibrated(raw: Cube, white: Cube, dark: Cube | None) -> Cube:
         np.broadcast_to(dark_line, span.shape).astype(np.float32),
         gain.astype(np.float32),
     )
-    about_raw = tuple(w for w in raw.warnings if w[0] != QUANTITY_OTHER)
+    about_raw = tuple(w for w in raw.warnings if w.code != QUANTITY_OTHER)
     warnings += implausible(sampled(pixels)[..., ~raw.bad_bands], calibrated=True)
     level = None if raw.saturation is None else pixels.calibrated(raw.saturation.astype(np.float32))
     return replace(
@@ -77,7 +79,7 @@ def calibrated(raw: Cube, white: Cube, dark: Cube | None) -> Cube:
     )
 
 
-def _fit(raw: Cube, reference: Cube, name: str) -> Warnings:
+def _check_fit(raw: Cube, reference: Cube, name: Literal["white", "dark"]) -> Notices:
     if reference.bands != raw.bands or reference.cols not in (1, raw.cols):
         raise CubeContentError(
             f"The {name} reference has {reference.cols} columns and {reference.bands} bands, "
@@ -87,33 +89,33 @@ def _fit(raw: Cube, reference: Cube, name: str) -> Warnings:
             expected=[raw.cols, raw.bands],
             found=[reference.cols, reference.bands],
         )
-    warnings: Warnings = ()
+    warnings: Notices = ()
     if raw.exposure and reference.exposure and abs(reference.exposure / raw.exposure - 1) > _EXPOSURE_TOLERANCE:
         text = (
             f"The {name} reference was exposed {reference.exposure / raw.exposure:.3g} times as long as the cube, as "
             "their files say; values are used as they stand."
         )
-        warnings = (("reference_exposure_differs", text),)
+        warnings = (Notice("reference_exposure_differs", text),)
     apart = np.abs(reference.wavelengths_nm - raw.wavelengths_nm)
     if (apart > _WAVELENGTH_TOLERANCE_NM).any():  # NaN, where either names none, does not count
         text = f"The {name} reference's wavelengths are up to {np.nanmax(apart):.1f} nm off the cube's."
-        warnings += ((f"{name}_wavelengths_differ", text),)
+        warnings += (Notice(_WAVELENGTHS_DIFFER[name], text),)
     return warnings
 
 
-def _to_common_units(raw: Cube, white: Cube, dark: Cube | None) -> tuple[tuple[float, float], Warnings]:
+def _to_common_units(raw: Cube, white: Cube, dark: Cube | None) -> tuple[tuple[float, float], Notices]:
     """What values of white and dark are multiplied by to be in the units of the raw cube, and a warning."""
     own = [cube.to_reflectance for cube in (raw, white, dark or white)]
     if all(factor is None for factor in own):
         return (1.0, 1.0), ()
     if any(factor is None for factor in own):
         text = "Cube and references are not of the same kind: some are counts, some reflectance already."
-        return (1.0, 1.0), (("reference_units_differ", text),)
+        return (1.0, 1.0), (Notice("reference_units_differ", text),)
     raw_factor, white_factor, dark_factor = (factor or 1.0 for factor in own)
     return (white_factor / raw_factor, dark_factor / raw_factor), ()
 
 
-def _saturated(white: Cube, line: Floats) -> Warnings:
+def _saturation_warning(white: Cube, line: Floats) -> Notices:
     """A warning where the white reference itself clips, on average over its rows, in a good band."""
     if white.saturation is None:
         return ()
@@ -122,7 +124,7 @@ def _saturated(white: Cube, line: Floats) -> Warnings:
     share = float(clipped.mean()) if clipped.size else 0.0
     if share <= _LEAST_CLIPPED_WHITE:
         return ()
-    return (("white_saturated", f"The white reference is saturated in {share:.1%} of its columns x bands."),)
+    return (Notice("white_saturated", f"The white reference is saturated in {share:.1%} of its columns x bands."),)
 
 
 def _mean_line(reference: Cube) -> Floats:

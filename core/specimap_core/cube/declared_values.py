@@ -1,4 +1,4 @@
-"""What a file says of its values, in whatever words its format has for it: one reading for all formats."""
+"""Read what a file declares of its values, in the words of any format."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from specimap_core.cube.wavelengths import Warnings
 from specimap_core.errors import CubeHeaderError
 from specimap_core.geometry.cameras import Floats
+from specimap_core.notices import Notice, Notices
 
 _NO_DATA = (
     "fillvalue",
@@ -65,7 +65,7 @@ _SEPARATORS = re.compile(r"[\s,{}\[\]()]+")
 class Declared:
     """What a file says of its values.
 
-    ``no_data``: stored values that stand for none, beside NaN. ``valid``: stored values outside of these two are
+    ``no_data``: stored values that stand for none, besides NaN. ``valid``: stored values outside of these two are
     none. ``gains``, ``offsets`` (1,) or (B,): stored * gain + offset is the value; ``divisor``: the value by it is
     reflectance. ``names`` of the fields that gave them, for messages. ``ceiling``: the stored value at which the
     sensor clips. ``unsigned``: integers are to be read without sign. ``reflectance``: the file calls its values so.
@@ -83,7 +83,7 @@ class Declared:
     other: str | None = None
     exposure: float | None = None
     names: Mapping[str, str] | None = None
-    warnings: Warnings = ()
+    warnings: Notices = ()
 
     def name(self, what: str) -> str:
         """The file's own word for ``gains``, ``offsets``, ``divisor``."""
@@ -96,21 +96,21 @@ def plain(name: str) -> str:
 
 
 def declared_of(
-    file_name: str, attributes: Mapping[str, object], *titles: str | None, remarks: str | None = None
+    file_name: str, attributes: Mapping[str, object], *titles: str | None, description: str | None = None
 ) -> Declared:
     """What the attributes of a data set, the fields of a header, or small variables beside an array declare.
 
     ``scale_factor`` and ``add_offset`` are CF's: stored * scale_factor + add_offset. Spelt otherwise
     (``Scale_Factor``, as NEON does), or of a data set that calls itself reflectance, a factor of more than 1 is
     what values are divided by. ``titles``: names and units that may call the values reflectance, or something else.
-    ``remarks``: free text, which is believed only where it speaks of something else and not of reflectance.
+    ``description``: free text, which is believed only where it speaks of something else and not of reflectance.
 
     Raises CubeHeaderError, whose ``details['field']`` names the attribute, for what is not a number, not finite, or
     a factor of zero.
     """
     found = {plain(name): (name, value) for name, value in attributes.items()}
     named = any("reflect" in (title or "").lower() for title in titles)
-    other = None if named else _other_quantity(titles, remarks)
+    other = None if named else _other_quantity(titles, description)
     reader = _Reader(file_name, found)
     names: dict[str, str] = {}
     scale = reader.first(_REFLECTANCE_GAINS, names, "gains")
@@ -122,16 +122,16 @@ def declared_of(
     divisor = reader.first((_DIVISOR,), names, "divisor")
     _check_factor(file_name, names.get("divisor"), divisor, positive=True)
     _check_factor(file_name, names.get("gains"), scale, positive=False)
-    warnings: Warnings = ()
+    warnings: Notices = ()
     if scale is not None and _divides(names["gains"], scale, named=named and offsets is None):
         text = f"'{names['gains']} = {scale[0]:g}' is taken for what values are divided by"
         if offsets is not None or divisor is not None:
             other = names.get("offsets") or names["divisor"]
-            warnings = (("scale_assumed", f"{text}, though '{other}' is there too."),)
+            warnings = (Notice("scale_assumed", f"{text}, though '{other}' is there too."),)
             scale = 1 / scale
         else:
             if names["gains"] == _CF_SCALE:
-                warnings = (("scale_assumed", f"{text}: as a factor it would make no reflectance."),)
+                warnings = (Notice("scale_assumed", f"{text}: as a factor it would make no reflectance."),)
             names["divisor"], divisor, scale = names.pop("gains"), scale, None
     return Declared(
         no_data=reader.no_data(),
@@ -149,14 +149,14 @@ def declared_of(
     )
 
 
-def _other_quantity(titles: Sequence[str | None], remarks: str | None) -> str | None:
-    """What names or units call the values, where that is not reflectance; None where nothing is said."""
+def _other_quantity(titles: Sequence[str | None], description: str | None) -> str | None:
+    """What names or units call the values, where that is not reflectance; None where they state nothing."""
     for title in titles:
         if (found := _OTHER_QUANTITY.search(title or "")) is not None:
             return (found["name"] or "radiance").lower()
-    if remarks and "reflect" not in remarks.lower():
+    if description and "reflect" not in description.lower():
         # A unit in free text may be of anything.
-        return next((m["name"].lower() for m in _OTHER_QUANTITY.finditer(remarks) if m["name"]), None)
+        return next((m["name"].lower() for m in _OTHER_QUANTITY.finditer(description) if m["name"]), None)
     return None
 
 

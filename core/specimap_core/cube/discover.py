@@ -1,4 +1,4 @@
-"""Which variable of a container (HDF5, NetCDF, MATLAB, .npz) is the cube, and which axis is which."""
+"""Find the cube among the variables of a container (HDF5, NetCDF, MATLAB, .npz), and the meaning of its axes."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from specimap_core.cube.model import readable_dtype
-from specimap_core.cube.printable import shown
+from specimap_core.cube.printable import printable
 from specimap_core.cube.spectral_units import read_unit
-from specimap_core.cube.wavelengths import Warnings
 from specimap_core.errors import CubeFormatError, CubeHeaderError
+from specimap_core.notices import Notice, Notices
 
 _CUBE_NAMES = ("cube", "reflectance", "hypercube", "spectra", "data", "image", "img", "hsi", "capture")
 _REFLECTANCE = re.compile(r"refl|rfl|albedo", re.IGNORECASE)
@@ -63,11 +63,11 @@ class Variable:
         """Name and shape, with the axes' names where they have some: ``'L1/data' (y 512, x 640, band 61)``."""
         named = len(self.axes) == len(self.shape) and any(self.axes)
         axes = self.axes if named else ("",) * len(self.shape)
-        sides = [f"{shown(axis)} {side}".strip() for axis, side in zip(axes, self.shape, strict=True)]
-        return f"'{shown(self.name)}' ({', '.join(sides[:_SHOWN])}{', ...' if len(sides) > _SHOWN else ''})"
+        sides = [f"{printable(axis)} {side}".strip() for axis, side in zip(axes, self.shape, strict=True)]
+        return f"'{printable(self.name)}' ({', '.join(sides[:_SHOWN])}{', ...' if len(sides) > _SHOWN else ''})"
 
 
-def choose_cube(path: Path, variables: Sequence[Variable], wanted: str | None = None) -> tuple[Variable, Warnings]:
+def choose_cube(path: Path, variables: Sequence[Variable], wanted: str | None = None) -> tuple[Variable, Notices]:
     """The variable with three axes, and a warning that names it where others could have been meant.
 
     Of several the one whose name says reflectance comes first, then the one whose name says cube, then the only one
@@ -91,7 +91,7 @@ def choose_cube(path: Path, variables: Sequence[Variable], wanted: str | None = 
     beside = [v.described() for v in found if v is not chosen]
     others = ", ".join(beside[:_SHOWN]) + (", ..." if len(beside) > _SHOWN else "")
     text = f"{path.name} holds several arrays that could be the cube. {chosen.described()} was taken, not {others}."
-    return chosen, (("dataset_chosen", f"{text} On the command line --cube FILE::DATASET takes another."),)
+    return chosen, (Notice("dataset_chosen", f"{text} On the command line --cube FILE::DATASET takes another."),)
 
 
 def _wanted(path: Path, variables: Sequence[Variable], wanted: str) -> Variable:
@@ -103,7 +103,7 @@ def _wanted(path: Path, variables: Sequence[Variable], wanted: str) -> Variable:
     )
     if len(named) != 1:
         what = "several arrays" if named else "no array"
-        raise _refusal(path, f"{what} called '{shown(wanted)}'", named or variables)
+        raise _refusal(path, f"{what} called '{printable(wanted)}'", named or variables)
     chosen = named[0]
     if not readable_dtype(chosen.dtype):
         raise _wrong_type(path, chosen)
@@ -131,10 +131,10 @@ def _preferred(found: Sequence[Variable], variables: Sequence[Variable]) -> Vari
 
 def _wrong_type(path: Path, variable: Variable) -> CubeHeaderError:
     return CubeHeaderError(
-        f"'{shown(variable.name)}' in {path.name} holds values of type {shown(str(variable.dtype))}.",
+        f"'{printable(variable.name)}' in {path.name} holds values of type {printable(str(variable.dtype))}.",
         advice="Save the cube as integers or real floating-point numbers.",
         field="dtype",
-        value=shown(str(variable.dtype)),
+        value=printable(str(variable.dtype)),
     )
 
 
@@ -146,7 +146,7 @@ def _refusal(path: Path, what: str, variables: Sequence[Variable]) -> CubeFormat
     return CubeFormatError(
         f"{path.name} holds {what}{f': {listed}' if listed else ''}.",
         advice=several if sum(len(v.shape) == 3 for v in arrays) > 1 else alone,
-        variables=[shown(v.name) for v in arrays[:20]],
+        variables=[printable(v.name) for v in arrays[:20]],
         shapes=[list(v.shape[:_SHOWN]) for v in arrays[:20]],
     )
 
@@ -162,14 +162,14 @@ def choose_wavelengths(variables: Sequence[Variable], cube: Variable) -> Variabl
     best = max(vectors, key=lambda v: (max(v.shape) in cube.shape, _groups_shared(v, cube)))
     if best.units is not None:
         return best
-    told = [
+    stated = [
         v
         for v in variables
         if v.text is not None
         and _UNITS_NAME.search(v.short_name)
         and (_WAVELENGTH_NAME.search(v.short_name) or read_unit(v.text).kind not in ("none", "unrecognised"))
     ]
-    nearest = max(told, key=lambda v: _groups_shared(v, best), default=None)
+    nearest = max(stated, key=lambda v: _groups_shared(v, best), default=None)
     return replace(best, units=nearest.text if nearest else _units_in_name(best.short_name))
 
 
@@ -227,7 +227,7 @@ def _units_in_name(name: str) -> str | None:
 
 def cube_axes(
     cube: Variable, wavelengths: Variable | None, *, reversed_axes: bool
-) -> tuple[tuple[int, int, int], Warnings]:
+) -> tuple[tuple[int, int, int], Notices]:
     """Which stored axes are rows, columns and bands, and a warning where that was a guess.
 
     The band axis is the only one as long as the wavelengths, else the one named so, else the last one (the first
@@ -237,18 +237,18 @@ def cube_axes(
     named = [i for i, name in enumerate(cube.axes) if _BAND_AXIS_NAME.search(name)]
     count = max(wavelengths.shape) if wavelengths else None
     fitting = [i for i, side in enumerate(cube.shape) if side == count]
-    warnings: Warnings = ()
+    warnings: Notices = ()
     if len(named) == 1 and (not fitting or named[0] in fitting):
         band = named[0]
     elif len(fitting) == 1:
         band = fitting[0]
         if len(named) == 1:
             text = f"The axes' names of {cube.described()} do not fit its {count} wavelengths"
-            warnings = (("axes_assumed", f"{text}; number {band} is taken as the bands'."),)
+            warnings = (Notice("axes_assumed", f"{text}; number {band} is taken as the bands'."),)
     else:
         band = usual if usual in fitting or not fitting else fitting[-1]
-        text = f"Nothing tells which axis of '{shown(cube.name)}' {cube.shape} is the bands'; number {band} it is."
-        warnings = (("axes_assumed", text),)
+        text = f"Nothing tells which axis of '{printable(cube.name)}' {cube.shape} is the bands'; number {band} it is."
+        warnings = (Notice("axes_assumed", text),)
     row, col = (i for i in range(3) if i != band)
     swapped = reversed_axes
     if len(cube.axes) == 3:

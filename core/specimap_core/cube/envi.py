@@ -13,9 +13,9 @@ from specimap_core.cube.model import Cube, describe
 from specimap_core.cube.npy import refuse_dataset
 from specimap_core.cube.pixels import ArrayPixels
 from specimap_core.cube.unpacked import bytes_of, scratch_array
-from specimap_core.cube.wavelengths import Warnings
 from specimap_core.errors import CubeHeaderError, CubeNotFoundError, CubeTruncatedError
 from specimap_core.geometry.cameras import Array
+from specimap_core.notices import Notice, Notices
 
 _HEADER_SUFFIX = ".hdr"
 _DATA_SUFFIXES = ("", ".raw", ".img", ".dat", ".bil", ".bip", ".bsq", ".bin", ".hyspex", ".cube", ".hsi", ".envi")
@@ -177,22 +177,22 @@ def _truncated(path: Path, expected: int, found: int) -> CubeTruncatedError:
     )
 
 
-def _longer(excess: int) -> Warnings:
+def _excess(excess: int) -> Notices:
     if not excess:
         return ()
-    return (("data_longer_than_header", f"The data hold {excess} bytes more than the header says."),)
+    return (Notice("data_longer_than_header", f"The data hold {excess} bytes more than the header says."),)
 
 
-def _mapped(path: Path, header: EnviHeader) -> tuple[Array, Warnings]:
+def _mapped(path: Path, header: EnviHeader) -> tuple[Array, Notices]:
     size, expected = path.stat().st_size, header.data_bytes
     if size < expected:
         raise _truncated(path, expected, size)
     count = (expected - header.offset) // header.dtype.itemsize
     data = np.memmap(path, header.dtype, "r", offset=header.offset, shape=(count,))
-    return np.asarray(data), _longer(size - expected)
+    return np.asarray(data), _excess(size - expected)
 
 
-def _unpacked(path: Path, header: EnviHeader) -> tuple[Array, Warnings]:
+def _unpacked(path: Path, header: EnviHeader) -> tuple[Array, Notices]:
     """The data of a gzip file; the header's offset counts in what comes out of it."""
     count = (header.data_bytes - header.offset) // header.dtype.itemsize
     # gzip shrinks by 1032 at most: a header that asks for more is refused before room is made for it.
@@ -218,4 +218,4 @@ def _unpacked(path: Path, header: EnviHeader) -> tuple[Array, Warnings]:
             advice="Correct 'file compression' in the header, or copy the data again.",
             field="file compression",
         ) from error
-    return out, _longer(excess)
+    return out, _excess(excess)

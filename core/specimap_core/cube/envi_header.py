@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from specimap_core.cube.declared_values import WORDS, Declared, check_counts, declared_of, plain
-from specimap_core.cube.printable import shown
+from specimap_core.cube.printable import printable
 from specimap_core.cube.spectral_units import read_unit
-from specimap_core.cube.wavelengths import Warnings
 from specimap_core.errors import CubeHeaderError
 from specimap_core.geometry.cameras import Floats
+from specimap_core.notices import Notice, Notices
 
 MAGIC = "ENVI"
 _LARGEST_HEADER = 32 << 20
@@ -42,7 +42,7 @@ _COMPLEX_TYPES = (6, 9)
 # Kinds of file that carry an ENVI header, but no plain cube of spectra behind it.
 _OTHER_FILE_TYPES = ("classification", "spectral library", "meta", "virtual", "tiff", "jpeg", "nitf", "hdf")
 # Two lines of one of these that differ leave open what the data mean.
-_TOLD_ONCE = (
+_UNIQUE_FIELDS = (
     "samples",
     "lines",
     "bands",
@@ -83,7 +83,7 @@ class EnviHeader:
     wavelength_units: str | None
     bad_band_list: Floats | None
     declared: Declared
-    warnings: Warnings
+    warnings: Notices
 
     @property
     def data_bytes(self) -> int:
@@ -152,16 +152,16 @@ def parse_fields(name: str, text: str) -> dict[str, str]:
                 following = next(lines, None)
                 if following is None:
                     raise CubeHeaderError(
-                        f"{name}: the list of '{shown(key)}' is not closed; the header is cut short.",
+                        f"{name}: the list of '{printable(key)}' is not closed; the header is cut short.",
                         advice="Copy the header again from where it was recorded.",
                         field=key,
                     )
                 if not following.lstrip().startswith(";"):
                     parts.append(following)
             value = "\n".join(parts).rpartition("}")[0].strip()
-        if key in _TOLD_ONCE and key in fields and not _same(fields[key], value):
+        if key in _UNIQUE_FIELDS and key in fields and not _same(fields[key], value):
             raise CubeHeaderError(
-                f"{name} gives '{key}' twice, as {shown(fields[key])!r} and {shown(value)!r}.",
+                f"{name} gives '{key}' twice, as {printable(fields[key])!r} and {printable(value)!r}.",
                 advice="Keep the right one of the two lines.",
                 field=key,
             )
@@ -202,10 +202,10 @@ class _Reader:
         interleave = self._required("interleave").lower()
         if interleave not in ("bsq", "bil", "bip"):
             raise self._wrong("interleave", "is none of bsq, bil, bip")
-        warnings: Warnings = ()
+        warnings: Notices = ()
         if "byte order" not in self._fields and dtype.itemsize > 1:
             text = "The header names no byte order; little endian is assumed."
-            warnings = (("byte_order_assumed", text),)
+            warnings = (Notice("byte_order_assumed", text),)
         return EnviHeader(
             rows,
             cols,
@@ -223,12 +223,12 @@ class _Reader:
 
     def _wrong(self, field: str, why: str) -> CubeHeaderError:
         value = self._fields.get(field, "")
-        told = shown(value)
+        stated = printable(value)
         return CubeHeaderError(
-            f"{self._name}: '{field} = {told}' {why}.",
+            f"{self._name}: '{field} = {stated}' {why}.",
             advice=f"Correct '{field}' in the header, or export the cube again.",
             field=field,
-            value=told,
+            value=stated,
         )
 
     def _required(self, field: str) -> str:
@@ -293,7 +293,7 @@ class _Reader:
     def _declared(self, bands: int) -> Declared:
         fields = {key: value.partition(";")[0] for key, value in self._fields.items() if plain(key) in WORDS}
         # Of a plot's titles the second is the values' own.
-        title, remarks = self._fields.get("z plot titles", "").partition(",")[2], self._fields.get("description")
-        declared = declared_of(self._name, fields, title, remarks=remarks)
+        title, description = self._fields.get("z plot titles", "").partition(",")[2], self._fields.get("description")
+        declared = declared_of(self._name, fields, title, description=description)
         check_counts(self._name, declared, bands)
         return declared

@@ -17,7 +17,7 @@ from specimap_core.cube.discover import Variable, choose_cube, choose_wavelength
 from specimap_core.cube.hdf_guard import as_text, guarded_dataset, open_guarded
 from specimap_core.cube.model import Cube, describe
 from specimap_core.cube.pixels import ArrayPixels, Pixels
-from specimap_core.cube.printable import shown
+from specimap_core.cube.printable import printable
 from specimap_core.cube.strided import native
 from specimap_core.cube.unpacked import scratch_array
 from specimap_core.errors import CubeContentError, CubeTruncatedError
@@ -108,14 +108,14 @@ def _wavelengths(
     node = file[cube.name]
     while True:
         lists = {}
-        told = []
+        stated = []
         for name, value in _attributes(node):
             array = np.asarray(value)
             if array.dtype.kind in "iuf" and array.size > 1:
                 lists[name] = Variable(name, array.shape, array.dtype), array
             elif (text := _text(value)) is not None:
-                told.append(Variable(name, (), np.dtype(object), text=text))
-        found = choose_wavelengths([*(variable for variable, _ in lists.values()), *told], cube)
+                stated.append(Variable(name, (), np.dtype(object), text=text))
+        found = choose_wavelengths([*(variable for variable, _ in lists.values()), *stated], cube)
         if found is not None and max(found.shape) in cube.shape:
             return found, lists[found.name][1].astype(np.float64).ravel()
         if node.name == "/":
@@ -146,8 +146,8 @@ def _axis_names(node: h5py.Dataset) -> tuple[str, ...]:
 
     Read as plain attributes: HDF5's own reader of them takes their type for granted, and crashes where it is another.
     """
-    said = {name: np.asarray(value) for name, value in _attributes(node) if name in _OF_AXES}
-    labels, scales = (said.get(name, np.empty(0)) for name in _OF_AXES)
+    stated = {name: np.asarray(value) for name, value in _attributes(node) if name in _OF_AXES}
+    labels, scales = (stated.get(name, np.empty(0)) for name in _OF_AXES)
     names = [""] * node.ndim
     if labels.shape == (node.ndim,):
         names = [_text(label) or "" for label in labels]
@@ -178,18 +178,18 @@ def _text(value: object) -> str | None:
 
 
 def _declared(path: Path, file: h5py.File, dataset: h5py.Dataset) -> Declared:
-    """What the cube's own attributes say of its values, and small data sets beside it (MATLAB keeps them so)."""
-    said: dict[str, object] = {}
+    """What the cube's own attributes declare of its values, and small data sets beside it (MATLAB keeps them so)."""
+    stated: dict[str, object] = {}
     group = dataset.parent
     for name in filter(str.isascii, map(as_text, group)):
         if plain(name) in WORDS and isinstance(group.get(name, getlink=True), h5py.HardLink):
             node = group[name]
             if isinstance(node, h5py.Dataset) and node.shape is not None and is_word(name, node.shape):
-                said[name] = guarded_dataset(path, file, as_text(node.name))[()]
-    said |= {name: value for name, value in _attributes(dataset) if plain(name) in (*WORDS, "unsigned")}
+                stated[name] = guarded_dataset(path, file, as_text(node.name))[()]
+    stated |= {name: value for name, value in _attributes(dataset) if plain(name) in (*WORDS, "unsigned")}
     named = ("long_name", "standard_name", "units", "unit")
     titles = (_text(value) for name, value in _attributes(dataset) if name.lower() in named)
-    return declared_of(path.name, said, as_text(dataset.name), *titles)
+    return declared_of(path.name, stated, as_text(dataset.name), *titles)
 
 
 def _pixels(path: Path, dataset: h5py.Dataset, axes: tuple[int, int, int]) -> Pixels:
@@ -227,7 +227,7 @@ class _ChunkedPixels(Pixels):
             return np.asarray(self._dataset[tuple(selection)]).transpose(self._axes)
         except OSError as error:
             raise CubeContentError(
-                f"'{shown(as_text(self._dataset.name))}' does not decode: {error}.",
+                f"'{printable(as_text(self._dataset.name))}' does not decode: {error}.",
                 advice="Save the cube again, uncompressed or with gzip.",
             ) from error
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import h5py
 
-from specimap_core.cube.printable import shown
+from specimap_core.cube.printable import printable
 from specimap_core.errors import CubeFormatError
 
 # Gzip, shuffle, Fletcher32, szip, n-bit, scale-offset and h5py's LZF: they come with the library.
@@ -52,8 +52,8 @@ def guarded_dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
     if foreign:
         called = foreign[0][3].decode("utf-8", "replace").split(";")[0].strip("\0 ")
         raise CubeFormatError(
-            f"{path.name} packs '{shown(name)}' with the HDF5 filter {foreign[0][0]} ({shown(called) or 'unnamed'}), "
-            "which is not supported.",
+            f"{path.name} packs '{printable(name)}' with the HDF5 filter {foreign[0][0]} "
+            f"({printable(called) or 'unnamed'}), which is not supported.",
             advice="Save it with gzip or uncompressed, for instance: h5repack -f GZIP=4 IN.h5 OUT.h5",
             filter=foreign[0][0],
         )
@@ -95,6 +95,6 @@ def _stored_outside(node: object) -> bool:
 
 def _leads_out(path: Path, name: str) -> CubeFormatError:
     return CubeFormatError(
-        f"{path.name} keeps '{shown(name)}' in other files, which are not read.",
+        f"{path.name} keeps '{printable(name)}' in other files, which are not read.",
         advice="Save everything in one file (h5repack does), or export the cube as ENVI.",
     )

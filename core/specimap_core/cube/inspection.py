@@ -1,4 +1,4 @@
-"""Is there anything usable in a cube? Cheap: a few sampled rows and the mean image, no second pass."""
+"""Inspect a cube for usable values. Cheap: a few sampled rows and the mean image, no second pass."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from specimap_core.cube.model import Cube
 from specimap_core.cube.outliers import saturated_share
 from specimap_core.cube.pixels import sampled_rows
-from specimap_core.cube.wavelengths import Warnings
 from specimap_core.errors import CubeContentError
 from specimap_core.geometry.cameras import Array
+from specimap_core.notices import Notice, Notices
 
 _SAMPLED_ROWS = 24
 _SAMPLED_PIXELS = 24 * 512
@@ -19,8 +19,8 @@ _LEAST_SATURATED_SHARE = 0.001
 _LEAST_ZERO_SHARE = 0.002
 
 
-def inspect(cube: Cube, mean: NDArray[np.float32]) -> Warnings:
-    """Warnings (code, sentence) about a cube's values; ``mean`` (rows, cols) is its mean image.
+def inspect(cube: Cube, mean: NDArray[np.float32]) -> Notices:
+    """Warnings about a cube's values; ``mean`` (rows, cols) is its mean image.
 
     Codes: ``single_band``, ``bands_all_zero``, ``pixels_nan``, ``values_nan``, ``pixels_zero``, ``saturated``. Raises
     CubeContentError for a cube without finite values, or whose values are all the same.
@@ -36,20 +36,20 @@ def inspect(cube: Cube, mean: NDArray[np.float32]) -> Warnings:
             f"All values of {cube.path.name} are the same.",
             advice="Check that the shutter was open and that the right file was given.",
         )
-    warnings: list[tuple[str, str]] = []
+    warnings: list[Notice] = []
     if cube.bands == 1:
-        warnings.append(("single_band", "The cube has one band only: it carries no spectra."))
+        warnings.append(Notice("single_band", "The cube has one band only: it carries no spectra."))
     zero = ~sample.any((0, 1)) & ~cube.bad_bands
     if zero.any():
         listed = ", ".join(str(i) for i in np.flatnonzero(zero)[:8]) + (", ..." if zero.sum() > 8 else "")
-        warnings.append(("bands_all_zero", f"{int(zero.sum())} bands hold zeros only: {listed}."))
+        warnings.append(Notice("bands_all_zero", f"{int(zero.sum())} bands hold zeros only: {listed}."))
     lost = int(np.isnan(mean).sum())
     if lost:
-        warnings.append(("pixels_nan", f"{lost} of {mean.size} pixels hold no value in any good band."))
+        warnings.append(Notice("pixels_nan", f"{lost} of {mean.size} pixels hold no value in any good band."))
     zero_pixels = int((mean == 0).sum())
     if zero_pixels > _LEAST_ZERO_SHARE * mean.size:
         text = f"{zero_pixels} of {mean.size} pixels are zero in all good bands, as where nothing was recorded."
-        warnings.append(("pixels_zero", f"{text} Their points are flagged (128)."))
+        warnings.append(Notice("pixels_zero", f"{text} Their points are flagged (128)."))
     if sample.dtype.kind == "f":
         missing = np.isnan(sample[..., ~cube.bad_bands])
         partly = missing & ~missing.all(-1, keepdims=True)
@@ -57,10 +57,11 @@ def inspect(cube: Cube, mean: NDArray[np.float32]) -> Warnings:
     else:
         holes = 0.0
     if holes:
-        warnings.append(("values_nan", f"About {holes:.2%} of the values are missing in pixels that have others."))
+        text = f"About {holes:.2%} of the values are missing in pixels that have others."
+        warnings.append(Notice("values_nan", text))
     share = saturated_share(sample[..., ~cube.bad_bands], _level(cube, columns))
     if share > _LEAST_SATURATED_SHARE:
-        warnings.append(("saturated", f"About {share:.1%} of the pixels are saturated in at least one band."))
+        warnings.append(Notice("saturated", f"About {share:.1%} of the pixels are saturated in at least one band."))
     return tuple(warnings)
 
 

@@ -46,7 +46,7 @@ class Matlab5Format:
             array = _values(path, file, found[cube.name])
             values = None if wavelengths is None else _values(path, file, found[wavelengths.name])
             small = [v for v in arrays_beside(variables, cube) if is_word(v.short_name, v.shape)]
-            said = {v.short_name: _values(path, file, found[v.name]) for v in small}
+            stated = {v.short_name: _values(path, file, found[v.name]) for v in small}
         axes, about_axes = cube_axes(cube, wavelengths, reversed_axes=False)
         return describe(
             path,
@@ -54,7 +54,7 @@ class Matlab5Format:
             ArrayPixels(array.transpose(axes)),
             wavelengths=None if values is None else values.astype(np.float64).ravel(),
             units=wavelengths.units if wavelengths else None,
-            declared=declared_of(path.name, said, cube.name),
+            declared=declared_of(path.name, stated, cube.name),
             # MATLAB's own order, rows x columns x bands, is no guess.
             warnings=about_choice + (() if wavelengths is None else about_axes),
         )

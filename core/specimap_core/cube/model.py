@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from specimap_core.cube.declared_values import Declared
 from specimap_core.cube.pixels import Pixels, read_bip, workers
-from specimap_core.cube.values import Quantity, settle
-from specimap_core.cube.wavelengths import Warnings, bad_band_mask, nanometres
+from specimap_core.cube.values import Quantity, interpret
+from specimap_core.cube.wavelengths import bad_band_mask, nanometres
 from specimap_core.errors import CubeHeaderError
 from specimap_core.geometry.cameras import Array, Floats
+from specimap_core.notices import Notices
 
 _HASH_CHUNK = 16 << 20
 
@@ -32,7 +33,7 @@ class Cube:
     ``wavelengths_nm`` (B,) is NaN where the file names none; ``bad_bands`` (B,). ``to_reflectance`` times a value is
     reflectance; None where the values are counts. ``saturation``: the value from which on a band counts as saturated,
     (), (B,) or (cols, B), NaN or None where that is unknown. ``exposure``: how long a line was exposed, in the file's
-    own unit, None where it does not say. ``warnings`` are (code, sentence). ``files`` are those
+    own unit, None where it does not say. ``files`` are those
     whose content makes the cube, ``datasets`` what was asked for by name in them.
     """
 
@@ -45,7 +46,7 @@ class Cube:
     quantity: Quantity
     to_reflectance: float | None
     saturation: Floats | None = field(repr=False)
-    warnings: Warnings
+    warnings: Notices
     datasets: tuple[str | None, ...] = ()
     exposure: float | None = None
 
@@ -151,7 +152,7 @@ def describe(
     units: str | None = None,
     bad_band_list: Floats | None = None,
     declared: Declared | None = None,
-    warnings: Warnings = (),
+    warnings: Notices = (),
 ) -> Cube:
     """A cube from what a format found: units, bad bands and what values mean are settled here for all formats.
 
@@ -159,18 +160,18 @@ def describe(
     """
     wavelengths_nm, about_wavelengths = nanometres(wavelengths, units, pixels.shape[2])
     bad_bands, about_bands = bad_band_mask(bad_band_list, pixels.shape[2])
-    meaning = settle(path.name, pixels, bad_bands, declared or Declared())
+    values = interpret(path.name, pixels, bad_bands, declared or Declared())
     return Cube(
         path=path,
         format_name=format_name,
-        pixels=meaning.pixels,
+        pixels=values.pixels,
         files=files or (path,),
         wavelengths_nm=wavelengths_nm,
         bad_bands=bad_bands,
-        quantity=meaning.quantity,
-        to_reflectance=meaning.to_reflectance,
-        saturation=meaning.saturation,
-        warnings=warnings + about_wavelengths + about_bands + meaning.warnings,
+        quantity=values.quantity,
+        to_reflectance=values.to_reflectance,
+        saturation=values.saturation,
+        warnings=warnings + about_wavelengths + about_bands + values.warnings,
         exposure=None if declared is None else declared.exposure,
     )
 

@@ -39,7 +39,7 @@ class NetCdf3Format:
             values: Floats | None = None
             if wavelengths is not None:
                 values = np.array(file.variables[wavelengths.name].data, np.float64).ravel()
-            array = _mapped_again(path, file.variables[cube.name].data)
+            array = _remapped(path, file.variables[cube.name].data)
             declared = _declared(path, cube.name, vars(file.variables[cube.name])["_attributes"])
         axes, warnings = cube_axes(cube, wavelengths, reversed_axes=False)
         return describe(
@@ -60,8 +60,8 @@ def _declared(path: Path, name: str, attributes: Mapping[str, object]) -> Declar
 
 
 def _units(variable: object) -> str | None:
-    told = {name.lower(): value for name, value in vars(variable).items()}
-    units = told.get("units", told.get("unit"))
+    stated = {name.lower(): value for name, value in vars(variable).items()}
+    units = stated.get("units", stated.get("unit"))
     return units.decode("utf-8", "replace") if isinstance(units, bytes) else None
 
 
@@ -72,7 +72,7 @@ def _content(name: str, data: Array) -> str | None:
     return None
 
 
-def _mapped_again(path: Path, data: Array) -> Array:
+def _remapped(path: Path, data: Array) -> Array:
     """The same bytes of the file through a map of our own: scipy's must be gone when its file closes."""
     base = data
     while isinstance(base.base, np.ndarray):

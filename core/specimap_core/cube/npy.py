@@ -14,11 +14,11 @@ from specimap_core.cube.declared_values import declared_of, is_word
 from specimap_core.cube.discover import Variable, arrays_beside, choose_cube, choose_wavelengths, cube_axes
 from specimap_core.cube.model import Cube, check_dtype, describe
 from specimap_core.cube.pixels import ArrayPixels
-from specimap_core.cube.printable import shown
+from specimap_core.cube.printable import printable
 from specimap_core.cube.unpacked import bytes_of, scratch_array
-from specimap_core.cube.wavelengths import Warnings
 from specimap_core.errors import CubeFormatError, CubeTruncatedError
 from specimap_core.geometry.cameras import Array, Floats
+from specimap_core.notices import Notice, Notices
 
 _NPY_MAGIC = b"\x93NUMPY"
 _ZIP_MAGIC = b"PK\x03\x04"
@@ -40,7 +40,7 @@ def refuse_dataset(path: Path, dataset: str | None) -> None:
     """Raises CubeFormatError where one is named in a file that holds a single array."""
     if dataset is not None:
         raise CubeFormatError(
-            f"{path.name} holds one cube, and no data sets with names such as '{shown(dataset)}'.",
+            f"{path.name} holds one cube, and no data sets with names such as '{printable(dataset)}'.",
             advice="Give the file alone, without '::'.",
         )
 
@@ -103,11 +103,11 @@ class NpyFormat:
                 advice="Save an array of three axes: rows x columns x bands.",
                 shape=list(header.shape),
             )
-        warnings: Warnings = ()
+        warnings: Notices = ()
         if header.shape[0] == min(header.shape) < min(header.shape[1:]):
             rows, cols, bands = header.shape
             text = f"The array is taken as {rows} rows x {cols} columns x {bands} bands, as .npy has no names for axes."
-            warnings = (("axes_assumed", text),)
+            warnings = (Notice("axes_assumed", text),)
         return describe(path, self.name, ArrayPixels(_mapped(path, header, header.header_bytes)), warnings=warnings)
 
 
@@ -138,7 +138,7 @@ class NpzFormat:
                 values = np.array(_member(path, archive, wavelengths.name, headers), np.float64).ravel()
             array = _member(path, archive, cube.name, headers)
             small = [v for v in arrays_beside(variables, cube) if is_word(v.short_name, v.shape)]
-            said = {v.short_name: _member(path, archive, v.name, headers) for v in small}
+            stated = {v.short_name: _member(path, archive, v.name, headers) for v in small}
         axes, about_axes = cube_axes(cube, wavelengths, reversed_axes=False)
         if values is None:  # an archive follows .npy: rows x columns x bands, where nothing speaks against it
             about_axes = ()
@@ -148,7 +148,7 @@ class NpzFormat:
             ArrayPixels(array.transpose(axes)),
             wavelengths=values,
             units=wavelengths.units if wavelengths else None,
-            declared=declared_of(path.name, said, cube.name),
+            declared=declared_of(path.name, stated, cube.name),
             warnings=about_choice + about_axes,
         )
 

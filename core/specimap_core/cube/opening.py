@@ -13,7 +13,7 @@ from specimap_core.cube.matlab5 import Matlab5Format
 from specimap_core.cube.model import Cube, CubeFormat
 from specimap_core.cube.netcdf3 import NetCdf3Format
 from specimap_core.cube.npy import NpyFormat, NpzFormat
-from specimap_core.cube.printable import shown
+from specimap_core.cube.printable import printable
 from specimap_core.cube.tiff import TiffFormat
 from specimap_core.errors import CubeFormatError, CubeNotFoundError, CubeNotReadableError, SettingsError, SpecimapError
 
@@ -78,7 +78,7 @@ def _open(given: Path) -> tuple[Cube, str | None]:
     except Exception as error:
         # Not a list of types: on damaged files the libraries raise anything, ZeroDivisionError included.
         raise CubeFormatError(
-            f"{path.name} cannot be read: {shown(str(error), 300) or type(error).__name__}.",
+            f"{path.name} cannot be read: {printable(str(error), 300) or type(error).__name__}.",
             advice="The file is damaged, incomplete, or not what its name says: copy or export it again.",
             path=str(path),
         ) from error
@@ -92,7 +92,7 @@ def _open(given: Path) -> tuple[Cube, str | None]:
 
 
 def _check_file(path: Path) -> None:
-    """What can be said before the content is looked at."""
+    """Refuse what needs no look at the content."""
     try:
         there = path.exists()
     except PermissionError:

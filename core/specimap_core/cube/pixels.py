@@ -1,4 +1,4 @@
-"""Where a cube's values come from: an array in memory or on disk, or something decoded as it is read."""
+"""Sources of a cube's values: an array in memory or on disk, or something decoded as it is read."""
 
 from __future__ import annotations
 

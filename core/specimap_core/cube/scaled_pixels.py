@@ -1,4 +1,4 @@
-"""Stored values of a cube as what they mean: no-data as NaN, gains and offsets applied."""
+"""Scale the stored values of a cube: gains and offsets applied, no-data as NaN."""
 
 from __future__ import annotations
 
@@ -49,8 +49,11 @@ class Missing:
             np.copyto(out, np.nan, where=dead)
 
 
-class MeantPixels(Pixels):
-    """Values as they are meant, floats. ``gains`` and ``offsets`` (bands,) or None; ``unsigned``: as in Declared."""
+class ScaledPixels(Pixels):
+    """Floats with gains and offsets applied and no-data as NaN.
+
+    ``gains`` and ``offsets`` (bands,) or None; ``unsigned``: as in Declared.
+    """
 
     def __init__(
         self, stored: Pixels, missing: Missing, gains: Floats | None, offsets: Floats | None, *, unsigned: bool = False
@@ -63,11 +66,11 @@ class MeantPixels(Pixels):
         self._offsets = None if offsets is None else offsets.astype(self.dtype)
 
     def block(self, start: int, stop: int) -> Array:
-        return self._meant(to_bip(self._stored.block(start, stop)), self._missing.dead, self._gains, self._offsets)
+        return self._scaled(to_bip(self._stored.block(start, stop)), self._missing.dead, self._gains, self._offsets)
 
     def band(self, index: int) -> Array:
         dead = self._missing.dead
-        return self._meant(
+        return self._scaled(
             self._stored.band(index),
             None if dead is None else dead[:, index],
             None if self._gains is None else self._gains[index],
@@ -78,7 +81,7 @@ class MeantPixels(Pixels):
         # A quarter: stored values, masks and results of a strip are alive at once.
         return max(1, super().strip_rows() // 4)
 
-    def _meant(self, raw: Array, dead: NDArray[np.bool_] | None, gains: Array | None, offsets: Array | None) -> Array:
+    def _scaled(self, raw: Array, dead: NDArray[np.bool_] | None, gains: Array | None, offsets: Array | None) -> Array:
         raw = as_unsigned(raw) if self._unsigned else raw
         # What is too large for the type becomes infinite, which is no value either.
         with np.errstate(over="ignore", invalid="ignore"):

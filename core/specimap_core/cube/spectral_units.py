@@ -7,7 +7,7 @@ import unicodedata
 from dataclasses import dataclass
 from typing import Literal
 
-from specimap_core.cube.printable import shown
+from specimap_core.cube.printable import printable
 from specimap_core.geometry.cameras import Floats
 
 Kind = Literal["length", "wavenumber", "frequency", "energy", "index", "none", "unrecognised"]
@@ -112,7 +112,7 @@ class Unit:
 
 def read_unit(text: str | None) -> Unit:
     """The unit that a file's own words mean: ``Nanometers``, ``um``, ``Wavenumbers (cm-1)``, ``GHz``, ``Index``."""
-    word = shown(" ".join((text or "")[:_LONGEST].replace("\0", " ").split()))
+    word = printable(" ".join((text or "")[:_LONGEST].replace("\0", " ").split()))
     plain = unicodedata.normalize("NFKC", word).replace("\N{MINUS SIGN}", "-").replace("\N{GREEK SMALL LETTER MU}", "u")
     plain = plain.replace("\N{LATIN CAPITAL LETTER A WITH RING ABOVE}", "A").lower()
     plain = unicodedata.normalize("NFKD", plain).encode("ascii", "ignore").decode()

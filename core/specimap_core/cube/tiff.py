@@ -23,9 +23,9 @@ from specimap_core.cube.npy import refuse_dataset, starts_with
 from specimap_core.cube.pixels import ArrayPixels
 from specimap_core.cube.tiff_wavelengths import named_wavelengths
 from specimap_core.cube.unpacked import scratch_array
-from specimap_core.cube.wavelengths import Warnings
 from specimap_core.errors import CubeFormatError, CubeTruncatedError
 from specimap_core.geometry.cameras import Array
+from specimap_core.notices import Notice, Notices
 
 _GDAL_METADATA, _GDAL_NODATA = 42112, 42113
 _GDAL_ITEM = re.compile(r"<Item\b[^>]*\bsample=\"(\d+)\"[^>]*>([^<]*)</Item>")
@@ -76,7 +76,7 @@ class TiffFormat:
         wavelengths, units = named_wavelengths(file)
         axes, about_axes = _axes(path, series, None if wavelengths is None else len(wavelengths))
         array = _values(path, file, series)
-        declared = declared_of(path.name, _said(file, array.shape[axes[2]] if len(axes) == 3 else 1))
+        declared = declared_of(path.name, _declared_attributes(file, array.shape[axes[2]] if len(axes) == 3 else 1))
         if len(axes) == 2:
             array, axes = array[..., None], (*axes, 2)
         return describe(
@@ -86,7 +86,7 @@ class TiffFormat:
             wavelengths=wavelengths,
             units=units,
             declared=declared,
-            warnings=packing + _about_others(file, series) + about_axes,
+            warnings=packing + _other_series(file, series) + about_axes,
         )
 
 
@@ -102,16 +102,16 @@ def _largest(file: tifffile.TiffFile) -> tifffile.TiffPageSeries:
     return max(file.series, key=lambda s: s.nbytes)
 
 
-def _about_others(file: tifffile.TiffFile, chosen: tifffile.TiffPageSeries) -> Warnings:
+def _other_series(file: tifffile.TiffFile, chosen: tifffile.TiffPageSeries) -> Notices:
     others = [s for s in file.series if s is not chosen and s.ndim >= 3 and s.nbytes * 2 > chosen.nbytes]
     if not others:
         return ()
     shown = ", ".join(f"{'x'.join(map(str, s.shape))} ({s.axes})" for s in others)
     text = f"The file holds several images; the one of {'x'.join(map(str, chosen.shape))} ({chosen.axes}) was taken"
-    return (("dataset_chosen", f"{text}, not {shown}."),)
+    return (Notice("dataset_chosen", f"{text}, not {shown}."),)
 
 
-def _check_packing(path: Path, series: tifffile.TiffPageSeries) -> Warnings:
+def _check_packing(path: Path, series: tifffile.TiffPageSeries) -> Notices:
     """Raises CubeFormatError for a compression or predictor that is not read, by its name."""
     keyframes = {id(page.keyframe): page.keyframe for page in series.pages if page is not None}
     packings = {_name(tifffile.COMPRESSION, page.compression) for page in keyframes.values()}
@@ -124,7 +124,8 @@ def _check_packing(path: Path, series: tifffile.TiffPageSeries) -> Warnings:
             compression=foreign[0],
         )
     if _JPEG in packings:
-        return (("values_lossy", "The TIFF is compressed with JPEG, which changes values: spectra are not exact."),)
+        text = "The TIFF is compressed with JPEG, which changes values: spectra are not exact."
+        return (Notice("values_lossy", text),)
     return ()
 
 
@@ -168,7 +169,7 @@ def _next_directory(file: tifffile.TiffFile) -> int:
     return int(struct.unpack(layout.offsetformat, link)[0])
 
 
-def _axes(path: Path, series: tifffile.TiffPageSeries, count: int | None) -> tuple[tuple[int, ...], Warnings]:
+def _axes(path: Path, series: tifffile.TiffPageSeries, count: int | None) -> tuple[tuple[int, ...], Notices]:
     """Stored axes as (rows, cols) or (rows, cols, bands), and a warning where that was a guess.
 
     The bands' axis is the one that is neither Y nor X, unless only another one is as long as the ``count`` of
@@ -199,14 +200,14 @@ def _values(path: Path, file: tifffile.TiffFile, series: tifffile.TiffPageSeries
     return out
 
 
-def _said(file: tifffile.TiffFile, bands: int) -> dict[str, object]:
+def _declared_attributes(file: tifffile.TiffFile, bands: int) -> dict[str, object]:
     """What GDAL's tags and the JSON description that tifffile writes say of the values."""
-    said: dict[str, object] = {}
+    stated: dict[str, object] = {}
     for described in file.shaped_metadata or ():
-        said |= {name: value for name, value in described.items() if plain(name) in WORDS}
+        stated |= {name: value for name, value in described.items() if plain(name) in WORDS}
     tags = file.pages.first.tags
     if _GDAL_NODATA in tags:
-        said["nodata"] = str(tags[_GDAL_NODATA].value)
+        stated["nodata"] = str(tags[_GDAL_NODATA].value)
     if _GDAL_METADATA in tags:
         text = str(tags[_GDAL_METADATA].value)
         for role, name, usual in (("scale", _GAINS, "1"), ("offset", _OFFSETS, "0")):
@@ -215,5 +216,5 @@ def _said(file: tifffile.TiffFile, bands: int) -> dict[str, object]:
                 sample = int(found[1])
                 if f'role="{role}"' in found[0] and sample < bands:
                     numbers[sample] = found[2]
-            said[name] = " ".join(numbers)
-    return said
+            stated[name] = " ".join(numbers)
+    return stated

@@ -1,4 +1,4 @@
-"""Where software puts wavelengths into a TIFF: tifffile's JSON, GDAL's metadata, OME's channels, ENVI's own words."""
+"""Read the wavelengths of a TIFF: from tifffile's JSON, GDAL's metadata, OME's channels, ENVI's own words."""
 
 from __future__ import annotations
 
@@ -57,14 +57,14 @@ def _in_mapping(described: dict[str, Any]) -> tuple[Floats, str | None] | None:
 
 def _in_gdal(text: str) -> tuple[Floats, str | None] | None:
     """Items ``wavelength`` of the bands (``sample``), or one of that name with them all; else GDAL's own, in um."""
-    told: dict[str, dict[str, str]] = {}
+    stated: dict[str, dict[str, str]] = {}
     for attributes, value in _ITEM.findall(text):
         named = dict(_ATTRIBUTE.findall(attributes))
-        told.setdefault(named.get("name", "").lower(), {})[named.get("sample", "")] = html.unescape(value).strip()
-    units = set(told.get("wavelength_units", told.get("wavelength_unit", {})).values())
+        stated.setdefault(named.get("name", "").lower(), {})[named.get("sample", "")] = html.unescape(value).strip()
+    units = set(stated.get("wavelength_units", stated.get("wavelength_unit", {})).values())
     unit = " or ".join(sorted(units)) or None
     for name, its_unit in (("wavelength", unit), ("wavelengths", unit), ("central_wavelength_um", "um")):
-        bands = told.get(name, {})
+        bands = stated.get(name, {})
         if "" in bands:
             return _numbers(re.split(r"[\s,{}]+", bands[""]), its_unit)
         if bands and set(bands) == {str(i) for i in range(len(bands))}:
@@ -87,8 +87,8 @@ def _in_description(text: str) -> tuple[Floats, str | None] | None:
             return None
         return _in_mapping(described) if isinstance(described, dict) else None
     found = re.search(r"\bwavelengths?\s*[=:]\s*[{\[(]([^}\])]*)[}\])]", text, re.IGNORECASE)
-    told = re.search(r"\bwavelength[ _]units?\s*[=:]\s*([^\s;,]+)", text, re.IGNORECASE)
-    return None if found is None else _numbers(re.split(r"[\s,;]+", found[1]), told[1] if told else None)
+    stated = re.search(r"\bwavelength[ _]units?\s*[=:]\s*([^\s;,]+)", text, re.IGNORECASE)
+    return None if found is None else _numbers(re.split(r"[\s,;]+", found[1]), stated[1] if stated else None)
 
 
 def _numbers(words: Sequence[str], unit: str | None) -> tuple[Floats, str | None] | None:

@@ -1,7 +1,7 @@
-"""What a value of a cube means, decided here for all formats: no-data, gains, reflectance, where the sensor clips.
+"""Interpret the values of a cube, for all formats: no-data, gains, reflectance, where the sensor clips.
 
-A file's own words come first; a sample of rows then tells where they are missing, contradict each other, or make no
-sense. What has no value is NaN from here on, for markers, references, clouds and pictures alike.
+A file's own statements come first; a sample of rows then shows where they are missing, contradict each other, or make
+no sense. What has no value is NaN from here on, for markers, references, clouds and pictures alike.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from specimap_core.cube.declared_values import Declared, check_counts
 from specimap_core.cube.outliers import bounds, clip_level, dead_elements, undeclared_no_data
 from specimap_core.cube.pixels import Pixels, sampled_rows
-from specimap_core.cube.scaled_pixels import MeantPixels, Missing, as_unsigned
+from specimap_core.cube.scaled_pixels import Missing, ScaledPixels, as_unsigned
 from specimap_core.cube.strided import to_bip
-from specimap_core.cube.wavelengths import Warnings
 from specimap_core.geometry.cameras import Array, Floats
+from specimap_core.notices import Notice, Notices
 
 Quantity = Literal["reflectance", "counts"]
 QUANTITY_OTHER = "quantity_not_reflectance"
@@ -34,18 +34,18 @@ _PERCENTILE_VALUES = 400_000
 
 
 @dataclass(frozen=True, eq=False)
-class Meaning:
+class InterpretedValues:
     """Pixels as they are to be read, and what their values are; see :class:`~specimap_core.cube.model.Cube`."""
 
     pixels: Pixels
     quantity: Quantity
     to_reflectance: float | None
     saturation: Floats | None
-    warnings: Warnings
+    warnings: Notices
 
 
-def settle(file_name: str, stored: Pixels, bad_bands: NDArray[np.bool_], declared: Declared) -> Meaning:
-    """What the stored values mean. Raises CubeHeaderError for gains or offsets that do not fit the bands."""
+def interpret(file_name: str, stored: Pixels, bad_bands: NDArray[np.bool_], declared: Declared) -> InterpretedValues:
+    """Interpret the stored values. Raises CubeHeaderError for gains or offsets that do not fit the bands."""
     bands = stored.shape[2]
     check_counts(file_name, declared, bands)
     gains = _per_band(declared.gains, bands, idle=1.0)
@@ -58,24 +58,24 @@ def settle(file_name: str, stored: Pixels, bad_bands: NDArray[np.bool_], declare
     good = ~bad_bands
     values = values[..., good]
     level = clip_level(_thinned(values), dtype, None if declared.divisor else declared.ceiling)
-    meant = _thinned(values, by_pixel=True)
+    converted = _thinned(values, by_pixel=True)
     if gains is not None or offsets is not None:
-        meant = meant * (1.0 if gains is None else gains[good]) + (0.0 if offsets is None else offsets[good])
+        converted = converted * (1.0 if gains is None else gains[good]) + (0.0 if offsets is None else offsets[good])
     real = dtype.kind == "f" or gains is not None or offsets is not None
-    to_reflectance, about_scale = _to_reflectance(meant, declared, real=real)
+    to_reflectance, about_scale = _to_reflectance(converted, declared, real=real)
     warnings = declared.warnings + about_missing + about_scale
     if to_reflectance is not None:
-        warnings += implausible(meant * to_reflectance)
+        warnings += implausible(converted * to_reflectance)
     elif real and declared.reflectance:
-        warnings += _percent(meant)
+        warnings += _percent_warning(converted)
     # One factor for all bands need not touch the values: integers are copied as they are.
     uniform = gains is not None and offsets is None and bool((gains == gains[0]).all()) and gains[0] > 0
     if uniform and gains is not None and to_reflectance is not None:
         to_reflectance, gains = to_reflectance * float(gains[0]), None
     pixels = stored
     if missing or gains is not None or offsets is not None or unsigned:
-        pixels = MeantPixels(stored, missing, gains, offsets, unsigned=unsigned)
-    return Meaning(
+        pixels = ScaledPixels(stored, missing, gains, offsets, unsigned=unsigned)
+    return InterpretedValues(
         pixels=pixels,
         quantity="counts" if to_reflectance is None else "reflectance",
         to_reflectance=to_reflectance,
@@ -105,39 +105,39 @@ def _thinned(values: Array, *, by_pixel: bool = False) -> Array:
     return values[:, ::step] if step > 1 else values
 
 
-def _missing(raw: Array, dtype: np.dtype, declared: Declared) -> tuple[Missing, Array, Warnings]:
+def _missing(raw: Array, dtype: np.dtype, declared: Declared) -> tuple[Missing, Array, Notices]:
     """Which stored values stand for none, the sample without them, and warnings."""
-    warnings: Warnings = ()
+    warnings: Notices = ()
     finite = [value for value in declared.no_data if np.isfinite(value)]
     possible = tuple(value for value in finite if _holds(dtype, value))
     impossible = [f"{value:g}" for value in finite if value not in possible]
     if impossible:
         text = f"The file's no-data value {', '.join(impossible)} is none that {dtype} can hold: nothing is left out."
-        warnings = (("no_data_impossible", text),)
+        warnings = (Notice("no_data_impossible", text),)
     low, high = declared.valid or (-np.inf, np.inf)
     missing = Missing(possible, low, high)
-    values = _without(raw, missing)
+    values = _without_missing(raw, missing)
     guessed = undeclared_no_data(values) if dtype.kind in "if" else None
     if guessed is not None:
         text = f"{guessed:g} stands where values are missing, though the file does not say so: it is taken for none."
-        warnings += (("no_data_undeclared", text),)
+        warnings += (Notice("no_data_undeclared", text),)
         missing = Missing((*possible, guessed), low, high)
-        values = _without(raw, missing)
+        values = _without_missing(raw, missing)
     if dtype.kind == "f" or dtype.itemsize > 2:
         lowest, highest = bounds(values)
         beyond = int(((values < lowest) | (values > highest)).sum())
         if beyond:
             share = beyond / max(int(np.isfinite(values).sum()), 1)
             text = f"About {share:.2%} of the values lie far beyond all others (largest {_largest(values):.3g})"
-            warnings += (("values_absurd", f"{text}: dead pixels, or no-data. They are taken for no value."),)
+            warnings += (Notice("values_absurd", f"{text}: dead pixels, or no-data. They are taken for no value."),)
             missing = Missing(missing.equal, max(low, lowest), min(high, highest))
-            values = _without(raw, missing)
+            values = _without_missing(raw, missing)
     dead = dead_elements(values)
     if dead is not None:
         columns = np.flatnonzero(dead.any(1))
         listed = ", ".join(map(str, columns[:8].tolist())) + (", ..." if len(columns) > 8 else "")
         text = f"{int(dead.sum())} detector elements are dead (columns {listed}); their values are taken for none."
-        warnings += (("detector_dead", text),)
+        warnings += (Notice("detector_dead", text),)
         missing = Missing(missing.equal, missing.low, missing.high, dead)
         values = np.where(dead, np.nan, values)
     return missing, values, warnings
@@ -156,38 +156,38 @@ def _holds(dtype: np.dtype, value: float) -> bool:
     return value == int(value) and info.min <= value <= info.max
 
 
-def _without(raw: Array, missing: Missing) -> Array:
+def _without_missing(raw: Array, missing: Missing) -> Array:
     out = raw.astype(np.float64 if raw.dtype.itemsize > 2 and raw.dtype != np.float32 else np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
         missing.mark(raw, out, missing.dead)
     return out
 
 
-def _to_reflectance(meant: Array, declared: Declared, *, real: bool) -> tuple[float | None, Warnings]:
+def _to_reflectance(converted: Array, declared: Declared, *, real: bool) -> tuple[float | None, Notices]:
     """What turns values into reflectance; None where they are something else."""
-    bright = _bright(meant)
+    bright = _bright(converted)
     if declared.divisor is None:
-        seems = real and (_looks_like_reflectance(meant) or _called_so(meant, declared))
+        seems = real and (_looks_like_reflectance(converted) or _declared_reflectance(converted, declared))
         if seems and declared.other is not None:
             text = f"The file calls its values {declared.other}: they are kept as they stand, and not as reflectance."
-            return None, ((QUANTITY_OTHER, text),)
+            return None, (Notice(QUANTITY_OTHER, text),)
         return (1.0 if seems else None), ()
     factor = declared.divisor
-    if real and bright is not None and bright / factor < _LEAST_BRIGHT and _looks_like_reflectance(meant):
+    if real and bright is not None and bright / factor < _LEAST_BRIGHT and _looks_like_reflectance(converted):
         text = f"'{declared.name('divisor')} = {factor:g}', but the values are reflectance already, up to {bright:.3g}"
-        return 1.0, (("reflectance_factor_unused", f"{text}: they are used as they stand."),)
+        return 1.0, (Notice("reflectance_factor_unused", f"{text}: they are used as they stand."),)
     return 1.0 / factor, ()
 
 
-def _called_so(meant: Array, declared: Declared) -> bool:
+def _declared_reflectance(converted: Array, declared: Declared) -> bool:
     """Whether scaled values of a data set called reflectance are to be believed, however dark or bright."""
-    bright = _bright(meant)
+    bright = _bright(converted)
     scaled = declared.gains is not None or declared.offsets is not None
     return declared.reflectance and scaled and bright is not None and bright <= _MOST_PERCENT
 
 
-def _bright(meant: Array) -> float | None:
-    finite = meant[np.isfinite(meant)]
+def _bright(converted: Array) -> float | None:
+    finite = converted[np.isfinite(converted)]
     return float(np.percentile(finite, 99.9)) if finite.size else None
 
 
@@ -200,16 +200,16 @@ def _looks_like_reflectance(values: Array) -> bool:
     return bool(low >= _REFLECTANCE_RANGE[0] and high <= _REFLECTANCE_RANGE[1])
 
 
-def _percent(meant: Array) -> Warnings:
+def _percent_warning(converted: Array) -> Notices:
     """A warning where what the file calls reflectance was not taken for it, and looks like percent."""
-    bright = _bright(meant)
+    bright = _bright(converted)
     if bright is None or not _REFLECTANCE_RANGE[1] < bright <= _MOST_PERCENT:
         return ()
     text = "The file calls its values reflectance, but they look like percent; they are kept as they stand."
-    return (("reflectance_implausible", text),)
+    return (Notice("reflectance_implausible", text),)
 
 
-def implausible(reflectance: Array, *, calibrated: bool = False) -> Warnings:
+def implausible(reflectance: Array, *, calibrated: bool = False) -> Notices:
     """A warning where what is called reflectance, a sample of it in good bands, cannot be.
 
     ``calibrated``: it was made of counts and references.
@@ -230,7 +230,7 @@ def implausible(reflectance: Array, *, calibrated: bool = False) -> Warnings:
         text = f"Half of the cube reflects more than {middle:.3g}: the scale seems wrong.{cause}"
     elif middle < _REFLECTANCE_RANGE[0]:
         text = f"Half of the cube has a reflectance below {middle:.2g}: offset or dark reference seem wrong."
-    return (("reflectance_implausible", text),) if text else ()
+    return (Notice("reflectance_implausible", text),) if text else ()
 
 
 def _saturation(level: float | None, gains: Floats | None, offsets: Floats | None, dtype: np.dtype) -> Floats | None:
@@ -243,5 +243,5 @@ def _saturation(level: float | None, gains: Floats | None, offsets: Floats | Non
     top = np.multiply(dtype.type(level), gain.astype(dtype), dtype=dtype)
     if offsets is not None:
         top = top + offsets.astype(dtype)
-    # With a negative gain the brightest is the smallest: it cannot be told by "at least".
+    # With a negative gain the brightest is the smallest: no "at least" finds it.
     return np.where(gain > 0, top, np.nan).astype(np.float64)

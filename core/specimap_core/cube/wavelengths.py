@@ -1,4 +1,4 @@
-"""Wavelengths in whatever unit a file gives them, in nanometres; or unknown, with a word about why."""
+"""Convert wavelengths to nanometres from whatever unit a file gives; unknown ones stay so, with a warning."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import numpy as np
 
 from specimap_core.cube.spectral_units import Unit, read_unit
 from specimap_core.geometry.cameras import Floats
-
-Warnings = tuple[tuple[str, str], ...]
+from specimap_core.notices import Notice, Notices
 
 # No optical instrument reaches beyond: what lies outside is in another unit, or no wavelength.
 _SHORTEST_NM, _LONGEST_NM = 100.0, 100_000.0
@@ -15,10 +14,9 @@ _SHORTEST_NM, _LONGEST_NM = 100.0, 100_000.0
 _LEAST_STEPPED_NM = 200.0
 # So few bands may truly lie at 1, 2 and 3 micrometres.
 _FEW_BANDS = 3
-_BAND_NUMBERS = "wavelengths_band_numbers"
 
 
-def nanometres(values: Floats | None, units: str | None, bands: int) -> tuple[Floats, Warnings]:
+def nanometres(values: Floats | None, units: str | None, bands: int) -> tuple[Floats, Notices]:
     """Wavelengths (bands,) in nm, NaN where the file does not say them, and what there is to warn of.
 
     ``units`` is the file's own word: a length, a wavenumber, a frequency or an energy. Where it is missing the
@@ -28,22 +26,22 @@ def nanometres(values: Floats | None, units: str | None, bands: int) -> tuple[Fl
     """
     unknown = np.full(bands, np.nan)
     if values is None or values.size == 0:
-        return unknown, (("wavelengths_missing", "The cube's file names no wavelengths."),)
+        return unknown, (Notice("wavelengths_missing", "The cube's file names no wavelengths."),)
     if values.size != bands:
         text = f"The cube has {bands} bands, its file names {values.size} wavelengths; they are not used."
-        return unknown, (("wavelengths_count_mismatch", text),)
+        return unknown, (Notice("wavelengths_count_mismatch", text),)
     values = values.astype(np.float64)
     unit = read_unit(units)
     if _are_band_numbers(values, unit):
         text = f"The cube's 'wavelengths' {_span(values)} are band numbers; its wavelengths are unknown."
-        return unknown, ((_BAND_NUMBERS, text),)
+        return unknown, (Notice("wavelengths_band_numbers", text),)
     if not (np.isfinite(values).all() and (values > 0).all()):
         text = "The cube's wavelengths are not all positive numbers; they are not used."
-        return unknown, (("wavelengths_invalid", text),)
+        return unknown, (Notice("wavelengths_invalid", text),)
     nm, warnings = _scaled(values, unit)
     if nm is None:
         return unknown, warnings
-    return nm, warnings + _about_order(nm)
+    return nm, warnings + _order_warnings(nm)
 
 
 def _are_band_numbers(values: Floats, unit: Unit) -> bool:
@@ -66,7 +64,7 @@ def _are_band_numbers(values: Floats, unit: Unit) -> bool:
     return False
 
 
-def _scaled(values: Floats, unit: Unit) -> tuple[Floats | None, Warnings]:
+def _scaled(values: Floats, unit: Unit) -> tuple[Floats | None, Notices]:
     """Wavelengths in nm; None where no reading of the numbers makes sense."""
     span = _span(values)
     if unit.kind not in ("none", "unrecognised"):
@@ -79,16 +77,16 @@ def _scaled(values: Floats, unit: Unit) -> tuple[Floats | None, Warnings]:
                 f"The wavelengths' unit ({unit.word}) and their numbers {span} contradict each other; "
                 f"they are taken as {guess[1]}."
             )
-            return guess[0], (("wavelength_units_contradict", text),)
+            return guess[0], (Notice("wavelength_units_contradict", text),)
         text = f"The wavelengths {span} in '{unit.word}' lie outside 100 nm to 100 um; they are not used."
-        return None, (("wavelengths_implausible", text),)
+        return None, (Notice("wavelengths_implausible", text),)
     guess = _guessed(values)
     if guess is None:
         text = f"The wavelengths {span} make no sense as nanometres or micrometres; they are not used."
-        return None, (("wavelengths_implausible", text),)
+        return None, (Notice("wavelengths_implausible", text),)
     if unit.kind == "unrecognised":
         text = f"The wavelengths' unit '{unit.word}' is not known; the numbers {span} are taken as {guess[1]}."
-        return guess[0], (("wavelength_units_unknown", text),)
+        return guess[0], (Notice("wavelength_units_unknown", text),)
     return guess[0], ()
 
 
@@ -102,35 +100,35 @@ def _guessed(values: Floats) -> tuple[Floats, str] | None:
 
 
 def _plausible(nm: Floats) -> bool:
-    # Rounded, for bounds must not hang on the last digit of a conversion.
+    # Rounded: bounds must not depend on the last digit of a conversion.
     return bool(np.round(nm.min(), 6) >= _SHORTEST_NM and np.round(nm.max(), 6) <= _LONGEST_NM)
 
 
-def _about_order(nm: Floats) -> Warnings:
+def _order_warnings(nm: Floats) -> Notices:
     steps = np.diff(nm)
     if (steps > 0).all() or (steps < 0).all():
         return ()
     if np.unique(nm).size < nm.size:
         text = f"Several bands have the same wavelength: {nm.size - np.unique(nm).size} of {nm.size} are repeated."
-        return (("wavelengths_repeated", text),)
+        return (Notice("wavelengths_repeated", text),)
     at = int(np.flatnonzero(np.sign(steps) != np.sign(nm[-1] - nm[0]))[0])
     text = f"The wavelengths are not in order: band {at + 1} is at {nm[at]:g} nm, the next at {nm[at + 1]:g} nm."
-    return (("wavelengths_unordered", text),)
+    return (Notice("wavelengths_unordered", text),)
 
 
 def _span(values: Floats) -> str:
     return f"{values[0]:g} ... {values[-1]:g}"
 
 
-def bad_band_mask(flags: Floats | None, bands: int) -> tuple[np.typing.NDArray[np.bool_], Warnings]:
+def bad_band_mask(flags: Floats | None, bands: int) -> tuple[np.typing.NDArray[np.bool_], Notices]:
     """Bad bands (bands,) from a bad-band list in which 0 marks a bad one, and what there is to warn of."""
     good = np.zeros(bands, bool)
     if flags is None:
         return good, ()
     if flags.size != bands:
         text = f"The cube has {bands} bands, its bad-band list {flags.size} entries; the list is not used."
-        return good, (("bad_bands_count_mismatch", text),)
+        return good, (Notice("bad_bands_count_mismatch", text),)
     bad = ~(flags > 0)
     if bad.all():
-        return good, (("bad_bands_all", "The bad-band list marks every band as bad; it is not used."),)
+        return good, (Notice("bad_bands_all", "The bad-band list marks every band as bad; it is not used."),)
     return bad, ()

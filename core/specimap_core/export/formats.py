@@ -1,4 +1,4 @@
-"""The files that a result can be had as, whoever makes them."""
+"""The file formats that a result is exported to."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ BLUR_SAMPLES = 41
 SIGMAS_BETWEEN_QUARTERS = 1.349
 """From a quarter to three quarters of a normal distribution."""
 LEAST_RISE = 0.02
-"""Linear light by which an edge must rise for its blur to be told."""
+"""Linear light by which an edge must rise for its blur to be measured."""
 UNMEASURED_PX = 0.5
 """Standard deviation of an edge, and of a corner, that gave no line."""
 

@@ -70,8 +70,8 @@ def shift_of_cells(light: Singles, squares: Floats, marker_ids: Sequence[int], d
         return np.zeros(0)
     places, lever = np.concatenate(ends), np.concatenate(levers)
     length = np.linalg.norm(places[:, 1] - places[:, 0], axis=1)
-    told = (lever >= LEAST_LEVER) & (length >= LEAST_CELL_PX)
-    (a, b, black), lever, length = np.moveaxis(places[told], 1, 0), lever[told], length[told]
+    usable = (lever >= LEAST_LEVER) & (length >= LEAST_CELL_PX)
+    (a, b, black), lever, length = np.moveaxis(places[usable], 1, 0), lever[usable], length[usable]
     if not len(a):
         return np.zeros(0)
     along, normal, depth = outward_normals(a, b, black)

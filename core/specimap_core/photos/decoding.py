@@ -76,8 +76,8 @@ class CameraStated:
 
     def same_as(self, other: CameraStated) -> bool:
         """Whether EXIF says that both are of one camera with one lens."""
-        told = bool(self.model and other.model) or bool(self.focal_35mm and other.focal_35mm)
-        return told and self.contradiction(other) is None
+        comparable = bool(self.model and other.model) or bool(self.focal_35mm and other.focal_35mm)
+        return comparable and self.contradiction(other) is None
 
 
 @dataclass(frozen=True)

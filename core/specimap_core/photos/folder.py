@@ -1,4 +1,4 @@
-"""What a folder of photos holds, by the ends of the names; what is passed over is named."""
+"""List the photos of a folder by the ends of their names; other files are named as passed over."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 from specimap_core.atomic import name_as_text
 from specimap_core.errors import NotFoundError, TooFewPhotosError
+from specimap_core.notices import Notice
 from specimap_core.photos.formats import NAMES, PHOTO_SUFFIXES, RAW_SUFFIXES
 
 MOST_NAMED = 20
@@ -21,13 +22,13 @@ class PhotoFolder:
     photos: list[Path]
     passed_over: tuple[tuple[str, str], ...]
 
-    def remarks(self) -> list[tuple[str, str]]:
-        """Code and sentence for the report, where something was passed over."""
+    def warnings(self) -> list[Notice]:
+        """A warning for the report where something was passed over."""
         if not self.passed_over:
             return []
         named = "; ".join(f"{name} ({why})" for name, why in self.passed_over[:MOST_NAMED])
         rest = len(self.passed_over) - MOST_NAMED
-        return [("files_passed_over", f"Not read: {named}{f'; and {rest} more' if rest > 0 else ''}.")]
+        return [Notice("files_passed_over", f"Not read: {named}{f'; and {rest} more' if rest > 0 else ''}.")]
 
 
 def photo_folder(folder: Path) -> PhotoFolder:
@@ -80,7 +81,7 @@ def photo_paths(folder: Path) -> list[Path]:
     found = photo_folder(folder)
     if not found.photos:
         raise TooFewPhotosError(
-            " ".join([f"{folder} holds no photo.", *(sentence for _, sentence in found.remarks())]),
+            " ".join([f"{folder} holds no photo.", *(warning.message for warning in found.warnings())]),
             advice=f"Name the folder that holds the photos themselves: {NAMES}.",
             found=0,
         )

@@ -1,4 +1,4 @@
-"""Which image files are photos: the one list that the folder's reader, the uploads and the documents share."""
+"""File formats of photos: the one list that the folder's reader, the uploads and the documents share."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What was captured: photos, upright and at a working size, each judged as it is read."""
+"""Read photos, upright and at a working size; each is judged as it is read."""
 
 from __future__ import annotations
 
@@ -201,13 +201,13 @@ def _too_few(
     elif refused:
         advice = "Details give the reason for each photo. " + advice
     first = unreadable[:1] or refused[:1]
-    beside = photo_folder(paths[0].parent).remarks() if paths else []
+    passed_over = photo_folder(paths[0].parent).warnings() if paths else []
     return leaf(
         " ".join(
             [
                 f"{len(photos)} usable photos of {len(paths)}; at least {least} are needed.",
                 *(f"{r.name}: {r.reason}" for r in first),
-                *(sentence for _, sentence in beside),
+                *(warning.message for warning in passed_over),
             ]
         ),
         advice=advice,

@@ -1,4 +1,4 @@
-"""How much fine texture photos show where the specimen lies: what image features are found by.
+"""Measure how much fine texture photos show at the specimen, which image features need.
 
 The measure is the share of a region whose structure tensor (Foerstner 1987) has a smaller eigenvalue above the photo's
 noise: there the brightness changes in every direction, at the scale of a feature's inner detail. Coarse shading, edges
@@ -100,6 +100,6 @@ def usual_share(photos: Iterable[tuple[Photo, Mask | None]]) -> float:
 
 
 def in_words(share: float, region: str) -> str:
-    """What a remark says of a share of ``region``."""
+    """Describe a share of ``region`` for a warning."""
     how = "much" if share >= MUCH else "some" if share >= SOME else "little"
     return f"{100 * share:.0f} % of {region} shows fine texture above the noise: {how}."

@@ -1,4 +1,4 @@
-"""What a finished stage leaves on disk, keyed by a hash of everything that went into it."""
+"""Artefacts of finished stages on disk, keyed by a hash of everything that went into them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from itertools import starmap
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from specimap_core.bundle_adjust.adjust import Adjusted
 from specimap_core.fiducials.observations import Observations
 from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
 from specimap_core.json_text import json_text
+from specimap_core.notices import Notice
 from specimap_core.photos.reading import Refusal
 from specimap_core.reconstruct.backend import CornersInPhotos, Reconstruction
 from specimap_core.reconstruct.dense.depth_map import DepthMap
@@ -107,7 +109,7 @@ def _poses(poses: tuple[Pose, ...]) -> np.ndarray[Any, Any]:
     return np.stack([p.matrix[:3] for p in poses])
 
 
-def _unposes(matrices: np.ndarray[Any, Any]) -> tuple[Pose, ...]:
+def _poses_of(matrices: np.ndarray[Any, Any]) -> tuple[Pose, ...]:
     return tuple(Pose(m[:, :3].copy(), m[:, 3].copy()) for m in matrices)
 
 
@@ -140,7 +142,7 @@ def save_stage1(store: Store, key: str, stage: Stage1) -> None:
         "names": stage.names,
         "refused": [asdict(x) for x in stage.refused],
         "refused_later": [asdict(x) for x in r.refused],
-        "remarks": r.remarks,
+        "remarks": [(warning.code, warning.message) for warning in r.warnings],
         "marker_ids": c.marker_ids,
         "subject_mm": stage.subject_mm,
     }
@@ -164,11 +166,11 @@ def load_stage1(store: Store, key: str, *, with_depth: bool = True) -> Stage1 | 
     reconstruction = Reconstruction(
         tuple(meta["photos"]),
         Intrinsics(**meta["lens"]),
-        _unposes(arrays["poses"]),
+        _poses_of(arrays["poses"]),
         tuple(maps),
         arrays["points"],
         tuple(Refusal(**x) for x in meta["refused_later"]),
-        tuple((a, b) for a, b in meta["remarks"]),
+        tuple(starmap(Notice, meta["remarks"])),
     )
     seen = Observations(arrays["seen_photo"], arrays["seen_marker"], arrays["seen_corners"], arrays["seen_sigma"])
     return Stage1(
@@ -214,7 +216,7 @@ def load_stage2(store: Store, key: str) -> Stage2 | None:
     x, meta = found
     adjusted = Adjusted(
         Intrinsics(**meta["lens"]),
-        _unposes(x["poses"]),
+        _poses_of(x["poses"]),
         tuple(meta["marker_ids"]),
         x["corners"],
         x["covariance"],

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 from specimap_core.errors import CancelledError
-from specimap_core.pipeline.failures import told_as_stage_failure
+from specimap_core.pipeline.failures import as_stage_failure
 
 STAGES = ("reconstruct", "adjust", "render", "register")
 Progress = Callable[[str, float], None]
@@ -55,7 +55,7 @@ class Clock:
         """Time a stage; yields its progress function. What a library raises in it becomes a StageFailedError."""
         self._running = name, time.perf_counter()
         self.report(name, 0.0)
-        with told_as_stage_failure(name):
+        with as_stage_failure(name):
             yield lambda share: self.report(name, share)
         self.seconds = self.so_far()
         self.report(name, 1.0)

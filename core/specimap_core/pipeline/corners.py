@@ -1,4 +1,4 @@
-"""Where the marker corners were seen, and how far the adjusted ones project from there, for the report."""
+"""Marker corners as measured and their reprojection residuals, for the report."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from specimap_core.bundle_adjust.adjust import Adjusted
 from specimap_core.bundle_adjust.solver import MarkerScene
 from specimap_core.geometry.cameras import Floats, View
 from specimap_core.pipeline.artefacts import Stage1
-from specimap_core.register.cube_markers import CubeMarkers
+from specimap_core.register.cube_markers import CubeMarkers, unmirrored
 from specimap_core.report.model import CubeCorners, PhotoCorners
 
 RESIDUAL_DIGITS = 2
@@ -45,9 +45,7 @@ def photo_corners(stage1: Stage1, adjusted: Adjusted) -> list[PhotoCorners]:
 def cube_corners(found: CubeMarkers, adjusted: Adjusted, view: View, rows: int, cols: int) -> CubeCorners:
     """Corners in the cube as it is stored, and residuals of its solved camera."""
     placed = adjusted.corners[[adjusted.marker_ids.index(i) for i in found.marker_ids]]
-    projected = view.project(placed)
-    if found.mirrored:
-        projected[..., 0] = cols - 1 - projected[..., 0]
+    projected = unmirrored(view.project(placed), found.mirrored, cols)
     return CubeCorners(
         rows=rows,
         cols=cols,

@@ -1,4 +1,4 @@
-"""What a library raises inside a stage, in our words: its own text means nothing to a user, and may hold paths."""
+"""Turn what a library raises inside a stage into an error of ours: its own text may hold paths, and helps no user."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _ADVICE = {
 
 
 @contextmanager
-def told_as_stage_failure(stage: str) -> Iterator[None]:
+def as_stage_failure(stage: str) -> Iterator[None]:
     """Raise StageFailedError for whatever a library raises within, MemoryExhaustedError where memory ran out.
 
     Leaves of SpecimapError pass, and so do the system's errors (OSError), which another attempt may not meet. The

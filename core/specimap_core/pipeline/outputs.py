@@ -1,4 +1,4 @@
-"""What a run reads and where its results lie; they appear together, once all are written."""
+"""Inputs and outputs of a run; the results appear together, once all are written."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def _is_utf8(folder: Path) -> bool:
 def staged(outputs: Outputs) -> Iterator[Outputs]:
     """A folder aside to write all results to; they replace those in ``outputs`` when the block succeeds.
 
-    The report goes first and comes last, so that whoever finds one finds the results that it speaks of.
+    The report goes first and comes last, so that a report always stands with the results that it describes.
 
     Raises:
         StorageFullError, OutputNotWritableError: nothing has been replaced then.

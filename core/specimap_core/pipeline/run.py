@@ -35,8 +35,9 @@ def run_pipeline(
     of SpecimapError; finished stages are kept then.
     """
     # Their imports are the slow ones.
-    from specimap_core.pipeline.register_stage import register_and_write
+    from specimap_core.pipeline.register_stage import CubeInput, register_stage
     from specimap_core.pipeline.stages import adjust_stage, reconstruct_stage, render_stage
+    from specimap_core.register.registration import Surface
     from specimap_core.surface.raycast import RayCaster
 
     settings.check()
@@ -50,7 +51,7 @@ def run_pipeline(
         fingerprint = background.submit(cube.fingerprint)
         # Inspecting it early refuses a useless cube before minutes of work.
         mean = cube.mean_image()
-        remarks = [*cube.warnings, *inspect(cube, mean), *photo_folder(inputs.photos).remarks()]
+        warnings = (*cube.warnings, *inspect(cube, mean), *photo_folder(inputs.photos).warnings())
         with ThreadPoolExecutor(workers) as pool:
             digests = {p.name: d for p, d in zip(paths, pool.map(_digest, paths), strict=True)}
         keys, store = surface_keys(digests, settings, backends), outputs.store
@@ -76,18 +77,9 @@ def run_pipeline(
             return done.model_copy(update={"reused_stages": list(STAGES)})
         caster = RayCaster(stage2.mesh)
         grids = render_stage(stage2, caster, settings, store, keys["render"], clock)
-        return register_and_write(
-            stage1,
-            stage2,
-            caster,
-            grids,
-            cube,
-            settings,
-            outputs,
-            clock,
-            remarks,
-            {"key": key, "cube": fingerprint.result(), "photos": digest_of(digests)},
-        )
+        surface = Surface(stage2.adjusted, stage2.sigma_mm, caster, *grids)
+        hashes = {"key": key, "cube": fingerprint.result(), "photos": digest_of(digests)}
+        return register_stage(stage1, surface, CubeInput(cube, warnings, hashes), settings, outputs, clock)
 
 
 def _digest(path: Path) -> str:

@@ -8,10 +8,11 @@ from pathlib import Path
 
 from specimap_core.cube import Cube, inspect, open_cube
 from specimap_core.errors import NotFoundError
+from specimap_core.notices import Notices
 from specimap_core.photos.folder import photo_paths
 from specimap_core.pipeline.artefacts import Stage1, Stage2, load_stage1, load_stage2
 from specimap_core.pipeline.clock import Clock, Progress
-from specimap_core.pipeline.failures import told_as_stage_failure
+from specimap_core.pipeline.failures import as_stage_failure
 from specimap_core.pipeline.outputs import Inputs, Outputs, prepare_folder
 from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.reconstruct.backends.environment import UNCONFIGURED, BackendSettings
@@ -48,7 +49,7 @@ def run_stage(run: StageRun, *, progress: Progress, cancelled: Callable[[], bool
     prepare_folder(run.out)
     clock = Clock(progress, cancelled, seconds=run.seconds, reused=run.reused)
     stages = {"reconstruct": _reconstruct, "adjust": _adjust, "render": _render, "register": _register}
-    with told_as_stage_failure(run.stage):
+    with as_stage_failure(run.stage):
         stages[run.stage](run, clock)
     return clock.seconds[run.stage]
 
@@ -57,7 +58,7 @@ def _reconstruct(run: StageRun, clock: Clock) -> None:
     from specimap_core.pipeline.stages import reconstruct_stage
 
     # A useless cube is refused before minutes of work.
-    _remarks(_cube(run))
+    _warnings(_cube(run))
     store = Outputs(run.out).store
     reconstruct_stage(
         photo_paths(run.inputs.photos),
@@ -90,8 +91,9 @@ def _render(run: StageRun, clock: Clock) -> None:
 
 def _register(run: StageRun, clock: Clock) -> None:
     from specimap_core.pipeline.artefacts import load_grids
-    from specimap_core.pipeline.register_stage import register_and_write
+    from specimap_core.pipeline.register_stage import CubeInput, register_stage
     from specimap_core.pipeline.stages import render_stage
+    from specimap_core.register.registration import Surface
     from specimap_core.surface.raycast import RayCaster
 
     outputs, cube = Outputs(run.out), _cube(run)
@@ -100,26 +102,17 @@ def _register(run: StageRun, clock: Clock) -> None:
     store, key = outputs.store, run.keys["render"]
     # Rendered again only where the grids are of another run of stage 2.
     grids = load_grids(store, key, stage2.mesh) or render_stage(stage2, caster, run.settings, store, key, clock)
-    register_and_write(
-        stage1,
-        stage2,
-        caster,
-        grids,
-        cube,
-        run.settings,
-        outputs,
-        clock,
-        _remarks(cube),
-        {"key": run.keys["register"], **run.hashes},
-    )
+    surface = Surface(stage2.adjusted, stage2.sigma_mm, caster, *grids)
+    given = CubeInput(cube, _warnings(cube), {"key": run.keys["register"], **run.hashes})
+    register_stage(stage1, surface, given, run.settings, outputs, clock)
 
 
 def _cube(run: StageRun) -> Cube:
     return open_cube(run.inputs.cube, white=run.inputs.white, dark=run.inputs.dark)
 
 
-def _remarks(cube: Cube) -> list[tuple[str, str]]:
-    return [*cube.warnings, *inspect(cube, cube.mean_image())]
+def _warnings(cube: Cube) -> Notices:
+    return cube.warnings + inspect(cube, cube.mean_image())
 
 
 def _stage1(run: StageRun, *, with_depth: bool) -> Stage1:

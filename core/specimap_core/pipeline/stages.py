@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from specimap_core.bundle_adjust.adjust import adjust
 from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
 from specimap_core.native import preload
+from specimap_core.notices import Notice
 from specimap_core.photos.contact_sheet import contact_sheet
-from specimap_core.photos.reading import Photo, Refusal, read_photos, stated_focal_px
+from specimap_core.photos.reading import Photo, read_photos, stated_focal_px
 from specimap_core.pipeline.artefacts import (
     Stage1,
     Stage2,
@@ -32,7 +33,7 @@ from specimap_core.reconstruct.backends.environment import UNCONFIGURED, Backend
 from specimap_core.reconstruct.backends.requirements import check_required
 from specimap_core.reconstruct.dense.depth_map import DepthMap
 from specimap_core.reconstruct.dense.volume import volume_over
-from specimap_core.reconstruct.focal_breathing import settle_breathing
+from specimap_core.reconstruct.focal_breathing import correct_focal_breathing
 from specimap_core.reconstruct.photo_resolution import at_own_resolution
 from specimap_core.render.orthographic import Grid, extent_of, render_grid
 from specimap_core.surface.fusion import fuse
@@ -89,7 +90,7 @@ def reconstruct_stage(
         )
         photos, detections = at_own_resolution(photos, detections, workers=workers)
         corners = corners_in_photos(photos, detections, settings.reconstruct.dictionary)
-        photos, corners, zooms = settle_breathing(
+        photos, corners, zooms = correct_focal_breathing(
             photos, corners, edge_mm=settings.adjust.edge_mm, focal_px=stated_focal_px(photos), workers=workers
         )
         if corners.solution is not None:
@@ -103,12 +104,12 @@ def reconstruct_stage(
             progress=lambda s: progress(0.2 + 0.8 * s),
         )
         if (zooms != 1).any():
-            remark = (
+            warning = Notice(
                 "focal_breathing",
                 f"The photos' focal lengths differ by {100 * zooms.std():.1f} % "
                 + ("(standard deviation); each photo was brought to the one they share."),
             )
-            reconstruction = replace(reconstruction, remarks=(*reconstruction.remarks, remark))
+            reconstruction = replace(reconstruction, warnings=(*reconstruction.warnings, warning))
         stage = Stage1(
             reconstruction,
             corners,
@@ -210,8 +211,3 @@ def render_stage(
         fine = render_grid(caster, low, high, settings.render.r_pc_mm)
         save_grids(store, key, (coarse, fine), stage2.mesh)
         return coarse, fine
-
-
-def all_refused(stage1: Stage1) -> list[Refusal]:
-    """Photos refused while reading and while reconstructing."""
-    return [*stage1.refused, *stage1.reconstruction.refused]

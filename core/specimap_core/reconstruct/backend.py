@@ -21,6 +21,7 @@ from specimap_core.fiducials.detection import (
 )
 from specimap_core.fiducials.observations import Observations
 from specimap_core.geometry.cameras import Intrinsics, Pose
+from specimap_core.notices import Notices
 from specimap_core.photos.reading import Photo, Refusal
 from specimap_core.reconstruct.dense.depth_map import DepthMap, DepthSettings
 
@@ -72,7 +73,7 @@ class Reconstruction:
 
     ``photos``: indices of the posed photos; ``poses``: their ``cam_from_world``; ``maps``: depth maps, whose
     ``photo`` counts in ``photos``; ``points`` (N, 3): sparse points; ``refused``: photos left out and why;
-    ``remarks``: (code, sentence) that the report should carry.
+    ``warnings``: for the report.
     """
 
     photos: tuple[int, ...]
@@ -81,7 +82,7 @@ class Reconstruction:
     maps: tuple[DepthMap, ...]
     points: NDArray[np.float32]
     refused: tuple[Refusal, ...]
-    remarks: tuple[tuple[str, str], ...]
+    warnings: Notices
 
 
 class ReconstructionBackend(Protocol):

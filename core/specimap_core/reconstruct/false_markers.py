@@ -1,4 +1,4 @@
-"""Markers that are none: texture read as one, with an id that no printed marker has."""
+"""Find false markers: texture read as a marker, with an id that no printed marker has."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LIKE_EDGE = 0.2
 """Relative difference from the markers' edge up to which a square is one of them."""
 
 
-def misread(corners: CornersInPhotos, solution: MarkerSolution) -> set[int]:
+def misread_ids(corners: CornersInPhotos, solution: MarkerSolution) -> set[int]:
     """Ids that no two photos show as a square of the markers' size at one place.
 
     Dictionaries of few bits, ARUCO_ORIGINAL above all, read such ids here and there. A marker that was moved is none of
@@ -49,7 +49,7 @@ def _two_agree(mine: Observations, order: dict[int, int], solution: MarkerSoluti
     return False
 
 
-def without(corners: CornersInPhotos, ids: set[int]) -> CornersInPhotos:
+def without_markers(corners: CornersInPhotos, ids: set[int]) -> CornersInPhotos:
     """The corners without some markers, not solved yet."""
     left = tuple(i for i in corners.marker_ids if i not in ids)
     keep = np.flatnonzero([i in left for i in corners.marker_ids])
@@ -57,7 +57,7 @@ def without(corners: CornersInPhotos, ids: set[int]) -> CornersInPhotos:
     return CornersInPhotos(replace(seen, marker=np.searchsorted(keep, seen.marker)), left)
 
 
-def start_without(solution: MarkerSolution, ids: set[int]) -> MarkerSolution:
+def start_without_markers(solution: MarkerSolution, ids: set[int]) -> MarkerSolution:
     """A solution to start from where some of its markers are gone; what it says of the corners is not carried on."""
     keep = [k for k, marker in enumerate(solution.markers) if marker not in ids]
     squares = solution.scene.squares

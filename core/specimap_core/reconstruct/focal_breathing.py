@@ -1,4 +1,4 @@
-"""Photos whose focal length breathes: a phone that refocuses zooms by up to a per cent.
+"""Estimate and correct focal breathing: a phone that refocuses changes its focal length by up to a per cent.
 
 Each photo's zoom against the shared lens is estimated with its pose from the markers it shows; photos and corners are
 then brought to the shared lens, so that nothing after this knows of it. Seen obliquely, the layout's perspective tells
@@ -23,7 +23,7 @@ from specimap_core.geometry.robust import MEDIAN_OF_RAYLEIGH
 from specimap_core.photos.colour import linear_from_srgb, srgb_from_linear
 from specimap_core.photos.reading import Photo
 from specimap_core.reconstruct.backend import CornersInPhotos
-from specimap_core.reconstruct.false_markers import misread, start_without, without
+from specimap_core.reconstruct.false_markers import misread_ids, start_without_markers, without_markers
 from specimap_core.reconstruct.poses_from_markers import MarkerSolution, solve_from_markers
 
 PRIOR_ZOOM = 0.02
@@ -35,12 +35,12 @@ LEAST_ZOOM = 2e-4
 """Zooms below this move nothing in a photo by a tenth of a pixel."""
 LEAST_MARKERS = 2
 """Markers that a photo must show: the perspective of one alone is lost in its corners' noise."""
-SETTLING = 3
+CORRECTION_ROUNDS = 3
 """Rounds of zooms and poses."""
 
 
 @dataclass(frozen=True)
-class Breathing:
+class FocalBreathing:
     """``zooms`` (P,): focal length of each photo over the shared one, 1 in the middle; ``sd`` (P,) of their logarithms;
     ``significance``: mean square of the logarithms over their variances, about 1 where nothing breathes."""
 
@@ -54,17 +54,17 @@ class Breathing:
         return float(self.zooms.std())
 
 
-def settle_breathing(
+def correct_focal_breathing(
     photos: list[Photo], corners: CornersInPhotos, *, edge_mm: float, focal_px: float | None, workers: int = 2
 ) -> tuple[list[Photo], CornersInPhotos, Floats]:
-    """Photos and corners as one shared lens would have seen them, with the zooms (P,) that were taken out.
+    """Resample photos and corners as one shared lens would have seen them; returns them with the zooms (P,) taken out.
 
     All zooms are 1, and the rest is as it came, where the photos do not differ beyond what their corners' noise
     explains, or where the markers alone do not solve. Markers that were read where none are leave the corners.
     """
     zooms, seen = np.ones(len(photos)), corners.seen
     solution: MarkerSolution | None = None
-    for turn in range(SETTLING + 1):
+    for turn in range(CORRECTION_ROUNDS + 1):
         try:
             solution = solve_from_markers(
                 seen, corners.marker_ids, photos[0].size, edge_mm=edge_mm, focal_px=focal_px, start=solution
@@ -72,8 +72,8 @@ def settle_breathing(
         except SpecimapError:
             solution = None
             break
-        if turn == 0 and 0 < len(wrong := misread(corners, solution)) < len(corners.marker_ids):
-            corners = without(corners, wrong)
+        if turn == 0 and 0 < len(wrong := misread_ids(corners, solution)) < len(corners.marker_ids):
+            corners = without_markers(corners, wrong)
             seen = corners.seen
             solution = solve_from_markers(
                 seen,
@@ -81,25 +81,25 @@ def settle_breathing(
                 photos[0].size,
                 edge_mm=edge_mm,
                 focal_px=focal_px,
-                start=start_without(solution, wrong),
+                start=start_without_markers(solution, wrong),
             )
         # The last solution is of the corners as they are handed on.
-        found = estimate_breathing(solution.scene, solution.seen) if turn < SETTLING else None
+        found = estimate_focal_breathing(solution.scene, solution.seen) if turn < CORRECTION_ROUNDS else None
         if found is None or (turn == 0 and found.significance < SIGNIFICANT):
             break
         zooms[list(solution.photos)] *= found.zooms
-        seen = bring_to_shared(corners.seen, zooms, photos[0].size)
+        seen = corners_at_shared_focal(corners.seen, zooms, photos[0].size)
     corners = replace(corners, seen=seen, solution=solution)
     if (zooms == 1).all():
         return photos, corners, zooms
     with ThreadPoolExecutor(workers) as pool:
-        images = pool.map(image_at_shared, (p.image for p in photos), zooms.tolist())
+        images = pool.map(image_at_shared_focal, (p.image for p in photos), zooms.tolist())
         steady = [replace(p, image=image) for p, image in zip(photos, images, strict=True)]
     return steady, corners, zooms
 
 
-def estimate_breathing(scene: MarkerScene, seen: Observations) -> Breathing | None:
-    """Zooms of the photos of a solved scene; None where fewer than three photos tell theirs.
+def estimate_focal_breathing(scene: MarkerScene, seen: Observations) -> FocalBreathing | None:
+    """Zooms of the photos of a solved scene; None where fewer than three photos determine theirs.
 
     ``seen`` indexes the scene's photos and markers.
     """
@@ -113,18 +113,18 @@ def estimate_breathing(scene: MarkerScene, seen: Observations) -> Breathing | No
         pixels = seen.corners_px[rows].reshape(-1, 2)
         zooms[photo], sd[photo], norm = _zoom_of(scene.lens, pose, corners, pixels, np.repeat(seen.sigma_px[rows], 4))
         left.append(norm)
-    told = sd < PRIOR_ZOOM / 2
-    if int(told.sum()) < 3:
+    known = sd < PRIOR_ZOOM / 2
+    if int(known.sum()) < 3:
         return None
-    # What the corners scatter by once their photo's zoom is free, beside what they were said to scatter by.
+    # Scatter of the corners once their photo's zoom is free, over the scatter that their sigma states.
     scatter = float(np.median(np.concatenate(left))) / MEDIAN_OF_RAYLEIGH
-    sd[told] *= scatter
-    zooms = np.where(told, zooms - np.median(zooms[told]), 0.0)
-    significance = float(np.mean((zooms[told] / sd[told]) ** 2))
-    # What a photo tells weakly is drawn toward one by as much.
-    spread = float(np.std(zooms[told]))
+    sd[known] *= scatter
+    zooms = np.where(known, zooms - np.median(zooms[known]), 0.0)
+    significance = float(np.mean((zooms[known] / sd[known]) ** 2))
+    # A zoom that is poorly determined is drawn toward one by as much.
+    spread = float(np.std(zooms[known]))
     zooms *= spread**2 / (spread**2 + sd**2)
-    return Breathing(np.exp(zooms), sd, significance)
+    return FocalBreathing(np.exp(zooms), sd, significance)
 
 
 def _zoom_of(
@@ -162,14 +162,14 @@ def _zoom_of(
     return zoom, float(np.sqrt(np.linalg.inv(H)[6, 6])), np.asarray(np.linalg.norm(left, axis=1) / sigma)
 
 
-def bring_to_shared(seen: Observations, zooms: Floats, size: tuple[int, int]) -> Observations:
+def corners_at_shared_focal(seen: Observations, zooms: Floats, size: tuple[int, int]) -> Observations:
     """The corners as the shared lens would have seen them; ``zooms`` (P,) by the photos that ``seen`` indexes, about
     the middle of photos of ``size`` (width, height)."""
     middle = (np.array(size) - 1) / 2
     return replace(seen, corners_px=(seen.corners_px - middle) / zooms[seen.photo][:, None, None] + middle)
 
 
-def image_at_shared(image: NDArray[np.uint8], zoom: float) -> NDArray[np.uint8]:
+def image_at_shared_focal(image: NDArray[np.uint8], zoom: float) -> NDArray[np.uint8]:
     """A photo (H, W, 3) as the shared lens would have seen it, same size, its border repeated where it grew."""
     if abs(np.log(zoom)) < LEAST_ZOOM:
         return image

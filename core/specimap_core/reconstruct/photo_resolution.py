@@ -2,7 +2,7 @@
 
 A photo that was enlarged, zoomed digitally, smoothed or taken out of focus has more pixels than it shows detail.
 Patches that are compared pixel by pixel then hold too little to compare, and the mesh is as fine as the pixels: worse
-and slower. How far a photo resolves is told by its markers, whose printed edges are sharp.
+and slower. A photo's resolution is measured at its markers, whose printed edges are sharp.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ def own_resolution(photos: Sequence[Photo], detections: Sequence[list[Detection]
 
     def blur(photo: Photo, found: list[Detection]) -> float:
         squares = np.array([d.corners_px for d in found]).reshape(-1, 4, 2)
-        told = edge_blurs(linear_from_srgb(photo.grey), squares) if found else np.zeros(0)
-        told = told[np.isfinite(told)]  # none may be measurable where the photo is overexposed
-        return float(np.median(told)) if told.size else float("nan")
+        blurs = edge_blurs(linear_from_srgb(photo.grey), squares) if found else np.zeros(0)
+        blurs = blurs[np.isfinite(blurs)]  # none may be measurable where the photo is overexposed
+        return float(np.median(blurs)) if blurs.size else float("nan")
 
     with ThreadPoolExecutor(workers) as pool:
         blurs = np.array(list(pool.map(blur, photos, detections)))

@@ -1,4 +1,4 @@
-"""Photos whose markers contradict the pose that they were given, as features may give one."""
+"""Find photos whose markers contradict their pose, as a pose by features may be wrong."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ OUTLIER_MEDIANS = 5.0
 LEAST_LEFT = 3
 
 
-def strays(lens: Intrinsics, poses: Mapping[int, Pose], corners: CornersInPhotos) -> dict[int, float]:
+def outlier_photos(lens: Intrinsics, poses: Mapping[int, Pose], corners: CornersInPhotos) -> dict[int, float]:
     """Photos in which most markers stand far from where the others put them, and how far in pixels.
 
     ``poses``: ``cam_from_world`` by photo. The worst is taken out first, since it moves the markers that the others are

@@ -10,11 +10,12 @@ import numpy as np
 from specimap_core.errors import PhotosNotConnectedError, TooFewPhotosError
 from specimap_core.fiducials.layout import marker_frame
 from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
+from specimap_core.notices import Notices
 from specimap_core.photos.reading import Photo, Refusal, stated_focal_px
 from specimap_core.reconstruct.backend import CornersInPhotos, ReconstructSettings
 from specimap_core.reconstruct.features.choice import check_features
-from specimap_core.reconstruct.pose_check import strays
-from specimap_core.reconstruct.poses_from_features import Reached, reach_by_motion, reach_by_places
+from specimap_core.reconstruct.pose_check import outlier_photos
+from specimap_core.reconstruct.poses_from_features import FeaturePoses, pose_by_resection, pose_by_structure_from_motion
 from specimap_core.reconstruct.poses_from_markers import MarkerSolution, solve_from_markers
 
 BLURRED_SHARE = 0.2
@@ -30,14 +31,14 @@ SOLVED = 0.05
 @dataclass(frozen=True)
 class Posed:
     """``photos``: indices of the posed photos, ascending; ``poses``: their ``cam_from_world`` in the marker frame, mm;
-    ``corners`` (Q, 4, 3) mm of the markers; ``refused``: photos left out and why; ``remarks``: (code, sentence)."""
+    ``corners`` (Q, 4, 3) mm of the markers; ``refused``: photos left out and why; ``warnings``: for the report."""
 
     photos: tuple[int, ...]
     lens: Intrinsics
     poses: tuple[Pose, ...]
     corners: Floats
     refused: tuple[Refusal, ...]
-    remarks: tuple[tuple[str, str], ...] = ()
+    warnings: Notices = ()
 
 
 def pose_photos(
@@ -63,38 +64,43 @@ def pose_photos(
     )
     progress(SOLVED)
     _refuse_two_scenes(photos, solution)
-    strange = _strange(photos, solution)
+    foreign = _foreign_photos(photos, solution)
     lens = solution.scene.lens
-    poses, weak, placed = _in_marker_frame(solution)
-    sure = {p: pose for p, pose in poses.items() if p not in weak}
-    waiting = [p for p in range(len(photos)) if p not in sure and p not in strange]
-    reached = Reached(sure, ())
+    poses, ambiguous, placed = _in_marker_frame(solution)
+    certain = {p: pose for p, pose in poses.items() if p not in ambiguous}
+    unposed = [p for p in range(len(photos)) if p not in certain and p not in foreign]
+    by_features = FeaturePoses(certain, ())
 
     def so_far(share: float) -> None:
         progress(SOLVED + (1 - SOLVED) * share)
 
-    if waiting and len(sure) >= LEAST_BY_MARKERS:
-        reached = reach_by_places(
+    if unposed and len(certain) >= LEAST_BY_MARKERS:
+        by_features = pose_by_resection(
             photos,
             lens,
-            sure,
-            {p: (poses[p], weak[p]) for p in weak},
-            waiting,
+            certain,
+            {p: (poses[p], ambiguous[p]) for p in ambiguous},
+            unposed,
             placed,
             settings,
             workers=workers,
             progress=so_far,
         )
-    elif waiting:
-        moved = reach_by_motion(photos, strange, corners, focal, settings, workers=workers, progress=so_far)
-        if moved is None:
-            reached = Reached(poses, ())
+    elif unposed:
+        by_motion = pose_by_structure_from_motion(
+            photos, foreign, corners, focal, settings, workers=workers, progress=so_far
+        )
+        if by_motion is None:
+            by_features = FeaturePoses(poses, ())
         else:
-            reached, lens, placed = moved
-    strayed = strays(lens, reached.poses, corners)
-    used = tuple(sorted(set(reached.poses) - set(strayed)))
-    strange |= {p: _elsewhere(photos[p], px) for p, px in strayed.items()}
-    refused = (*strange.values(), *_left_out(photos, [p for p in waiting if p not in reached.poses], weak))
+            by_features, lens, placed = by_motion
+    outliers = outlier_photos(lens, by_features.poses, corners)
+    used = tuple(sorted(set(by_features.poses) - set(outliers)))
+    foreign |= {p: _foreign_refusal(photos[p], px) for p, px in outliers.items()}
+    refused = (
+        *foreign.values(),
+        *_unposed_refusals(photos, [p for p in unposed if p not in by_features.poses], ambiguous),
+    )
     if len(used) < 3:
         raise TooFewPhotosError(
             f"Only {len(used)} photos could be posed.",
@@ -102,24 +108,24 @@ def pose_photos(
             refused={r.name: r.reason for r in refused},
         )
     progress(1.0)
-    return Posed(used, lens, tuple(reached.poses[p] for p in used), placed, refused, reached.remarks)
+    return Posed(used, lens, tuple(by_features.poses[p] for p in used), placed, refused, by_features.warnings)
 
 
 def _in_marker_frame(solution: MarkerSolution) -> tuple[dict[int, Pose], dict[int, Pose], Floats]:
-    """Poses, the other poses of photos with one marker, and the corners."""
+    """Poses, the second poses of photos that one marker leaves ambiguous, and the corners."""
     frame = marker_frame(solution.scene.corners, np.stack([p.centre for p in solution.scene.poses]))
     back = frame.inverse()
     poses = {p: pose @ back for p, pose in zip(solution.photos, solution.scene.poses, strict=True)}
-    weak = {p: pose @ back for p, pose in solution.weak.items()}
-    return poses, weak, frame.apply(solution.scene.corners)
+    ambiguous = {p: pose @ back for p, pose in solution.ambiguous.items()}
+    return poses, ambiguous, frame.apply(solution.scene.corners)
 
 
 def _refuse_two_scenes(photos: list[Photo], solution: MarkerSolution) -> None:
-    """A few foreign photos are left out later; many are a second scene, and which one is meant is not ours to say."""
-    strange = sorted([*solution.foreign, *solution.unconnected])
-    if len(strange) < max(3, FOREIGN_SHARE * len(photos)):
+    """Raise PhotosNotConnectedError where many photos are foreign: two scenes. A few are left out later."""
+    foreign = sorted([*solution.foreign, *solution.unconnected])
+    if len(foreign) < max(3, FOREIGN_SHARE * len(photos)):
         return
-    names = [photos[p].name for p in strange]
+    names = [photos[p].name for p in foreign]
     how = (
         "show the markers at other places than the rest"
         if len(solution.foreign) >= len(solution.unconnected)
@@ -132,28 +138,28 @@ def _refuse_two_scenes(photos: list[Photo], solution: MarkerSolution) -> None:
     )
 
 
-def _strange(photos: list[Photo], solution: MarkerSolution) -> dict[int, Refusal]:
-    """Photos whose markers contradict the rest, or are none of the rest's."""
-    foreign = {p: _elsewhere(photos[p], rms) for p, rms in solution.foreign.items()}
+def _foreign_photos(photos: list[Photo], solution: MarkerSolution) -> dict[int, Refusal]:
+    """Refuse photos whose markers contradict the rest, or are none of the rest's."""
+    foreign = {p: _foreign_refusal(photos[p], rms) for p, rms in solution.foreign.items()}
     return foreign | {
         p: Refusal(photos[p].name, "photo_foreign", "It shows markers, but none that the other photos show.")
         for p in solution.unconnected
     }
 
 
-def _elsewhere(photo: Photo, px: float) -> Refusal:
+def _foreign_refusal(photo: Photo, px: float) -> Refusal:
     return Refusal(photo.name, "photo_foreign", f"Its markers stand {px:.0f} px from where the others show them.")
 
 
-def _left_out(photos: list[Photo], open_photos: list[int], weak: dict[int, Pose]) -> list[Refusal]:
+def _unposed_refusals(photos: list[Photo], unposed: list[int], ambiguous: dict[int, Pose]) -> list[Refusal]:
     usual = float(np.median([p.sharpness for p in photos]))
-    return [_why(photos[p], p in weak, photos[p].sharpness < BLURRED_SHARE * usual) for p in open_photos]
+    return [_refusal(photos[p], p in ambiguous, photos[p].sharpness < BLURRED_SHARE * usual) for p in unposed]
 
 
-def _why(photo: Photo, weak: bool, blurred: bool) -> Refusal:
+def _refusal(photo: Photo, ambiguous: bool, blurred: bool) -> Refusal:
     if blurred:
         return Refusal(photo.name, "photo_blurred", "It is blurred: no marker reads, and nothing matches the others.")
-    if weak:
+    if ambiguous:
         return Refusal(
             photo.name, "photo_ambiguous", "Its single marker leaves two poses, and its features decide neither."
         )

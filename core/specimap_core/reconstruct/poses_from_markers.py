@@ -31,7 +31,7 @@ LEAST_AGREEING = 3
 class MarkerSolution:
     """Stage 1's answer from markers.
 
-    ``photos`` and ``markers``: the indices and ids that ``scene``'s poses and corners belong to. ``weak``:
+    ``photos`` and ``markers``: the indices and ids that ``scene``'s poses and corners belong to. ``ambiguous``:
     photos posed by a single marker whose two poses fit almost alike, with the other pose. ``foreign``: photos
     that contradict the rest, by their RMS in pixels.
     """
@@ -41,7 +41,7 @@ class MarkerSolution:
     seen: Observations
     photos: tuple[int, ...]
     markers: tuple[int, ...]
-    weak: dict[int, Pose]
+    ambiguous: dict[int, Pose]
     foreign: dict[int, float]
     unconnected: tuple[int, ...]
 
@@ -73,7 +73,7 @@ def solve_from_markers(
     best = min((_solve_start(seen, marker_ids, lens, edge_mm, focal_px, start) for lens in lenses), key=_rank)
     if best.info.rms_after_px > limit or best.foreign:
         # A layout averaged over two scenes fits neither: find the one that most photos share.
-        agreed = [_solve_agreed(seen, marker_ids, lens, edge_mm, focal_px, limit) for lens in lenses]
+        agreed = [_solve_consensus(seen, marker_ids, lens, edge_mm, focal_px, limit) for lens in lenses]
         best = min([best, *(s for s in agreed if s)], key=lambda s: (s.info.rms_after_px > limit, _rank(s)))
     if best.info.rms_after_px > 2 * limit:
         raise MarkerGeometryError(
@@ -88,7 +88,7 @@ def _rank(solution: MarkerSolution) -> tuple[int, float]:
     return len(solution.foreign) + len(solution.unconnected), solution.info.cost
 
 
-def _solve_agreed(
+def _solve_consensus(
     seen: Observations,
     marker_ids: tuple[int, ...],
     lens: Intrinsics,
@@ -115,7 +115,7 @@ def _solve_start(
     start: MarkerSolution | None = None,
 ) -> MarkerSolution:
     picked = agreeing_poses(seen, two_poses(seen.corners_px, lens, edge_mm))
-    poses, squares = _placed(start, marker_ids) if start else ({}, _most_seen(seen, picked))
+    poses, squares = _poses_by_index(start, marker_ids) if start else ({}, _most_seen(seen, picked))
     lost = _chain(seen, picked, poses, squares)
     seen = seen.of(np.isin(seen.photo, list(poses)) & np.isin(seen.marker, list(squares)))
     photos, markers = tuple(sorted(poses)), tuple(sorted(squares))
@@ -124,7 +124,7 @@ def _solve_start(
     scene = MarkerScene(lens, tuple(poses[p] for p in photos), corners_of(world, edge_mm), world)
     scene, info = solve(scene, inner, edge_mm=edge_mm, refine_lens=True, focal_prior_px=focal_prior, iterations=60)
     # A photo whose flipped pose fits the solved markers better is turned over; then once more from there.
-    scene, weak = _unflip(scene, inner, edge_mm)
+    scene, ambiguous = _resolve_ambiguities(scene, inner, edge_mm)
     scene, info = solve(scene, inner, edge_mm=edge_mm, refine_lens=True, focal_prior_px=focal_prior, iterations=60)
     residual = np.sqrt((scene.residuals(inner) ** 2).sum(-1).mean(1))
     limit = max(OUTLIER_PX, 5 * float(np.median(residual)))
@@ -134,15 +134,15 @@ def _solve_start(
         if np.median(own) > limit:
             foreign[photos[k]] = float(np.median(own))
     keep = np.array([photos[p] not in foreign for p in inner.photo]) & (residual <= limit)
-    weak = {photos[p]: pose for p, pose in weak.items()}
+    ambiguous = {photos[p]: pose for p, pose in ambiguous.items()}
     if foreign or not keep.all():
-        scene, info, inner, photos, markers = _without(scene, inner, keep, photos, markers, edge_mm, focal_prior)
+        scene, info, inner, photos, markers = _solve_without(scene, inner, keep, photos, markers, edge_mm, focal_prior)
     ids = tuple(marker_ids[m] for m in markers)
-    weak = {p: pose for p, pose in weak.items() if p in photos}
-    return MarkerSolution(scene, info, inner, photos, ids, weak, foreign, lost)
+    ambiguous = {p: pose for p, pose in ambiguous.items() if p in photos}
+    return MarkerSolution(scene, info, inner, photos, ids, ambiguous, foreign, lost)
 
 
-def _without(
+def _solve_without(
     scene: MarkerScene,
     seen: Observations,
     keep: np.ndarray[tuple[int, ...], np.dtype[np.bool_]],
@@ -188,7 +188,7 @@ def _most_seen(seen: Observations, picked: list[Pose | None]) -> dict[int, Pose]
     return {int(np.bincount(posed).argmax()): Pose(np.eye(3), np.zeros(3))}
 
 
-def _placed(solution: MarkerSolution, marker_ids: tuple[int, ...]) -> tuple[dict[int, Pose], dict[int, Pose]]:
+def _poses_by_index(solution: MarkerSolution, marker_ids: tuple[int, ...]) -> tuple[dict[int, Pose], dict[int, Pose]]:
     """Poses of the photos and of the markers of a solution, the latter by their place in ``marker_ids``."""
     squares = zip(solution.markers, solution.scene.squares or (), strict=True)
     return (
@@ -231,14 +231,14 @@ def _chain(
     return tuple(sorted(set(by_photo) - set(poses)))
 
 
-def _unflip(scene: MarkerScene, seen: Observations, edge_mm: float) -> tuple[MarkerScene, dict[int, Pose]]:
+def _resolve_ambiguities(scene: MarkerScene, seen: Observations, edge_mm: float) -> tuple[MarkerScene, dict[int, Pose]]:
     """Give each photo the pose, among those its single squares offer, that fits all it sees best.
 
     Returns the scene and the photos that show one marker only and whose other pose fits almost as well.
     """
     assert scene.squares is not None
     poses = list(scene.poses)
-    weak: dict[int, Pose] = {}
+    ambiguous: dict[int, Pose] = {}
     choices = two_poses(seen.corners_px, scene.lens, edge_mm)
     back = [square.inverse() for square in scene.squares]
     for p in range(len(poses)):
@@ -258,5 +258,5 @@ def _unflip(scene: MarkerScene, seen: Observations, edge_mm: float) -> tuple[Mar
                 if np.trace(options[k].R.T @ poses[p].R) < 2.9 and costs[k] < 4 * costs[best] + 0.3
             ]
             if away:
-                weak[p] = options[min(away, key=lambda k: costs[k])]
-    return MarkerScene(scene.lens, tuple(poses), scene.corners, scene.squares), weak
+                ambiguous[p] = options[min(away, key=lambda k: costs[k])]
+    return MarkerScene(scene.lens, tuple(poses), scene.corners, scene.squares), ambiguous

@@ -1,4 +1,4 @@
-"""Photos that markers do not reach: located by features against the photos that markers posed.
+"""Resection of photos without a pose, by features triangulated from the posed photos.
 
 Features are matched between neighbours in viewing angle, triangulated with the known poses, and a photo without a
 pose is then resected by LO-RANSAC (COLMAP). Each pair of photos is matched once.
@@ -26,16 +26,16 @@ RESECTION_PX = 4.0
 NEAREST = 4
 """Photos that a photo with a rough pose is compared with, for each such pose."""
 
-PLACING_PARTNERS = 4
+TRIANGULATION_PARTNERS = 4
 """Neighbours that a posed photo's features are triangulated with, where they are matched already; two otherwise."""
 
 Tick = Callable[[], None]
-Seen = tuple[int, int]
+TurnedPhoto = tuple[int, int]
 """A photo, and the quarter turn in which it was described."""
 
 
 @dataclass(frozen=True)
-class Located:
+class ResectedPose:
     """A photo's resected pose with the number and share of matches that agree, and the quarter ``turn`` in which its
     features were described."""
 
@@ -71,24 +71,24 @@ class Locator:
         self._kind = kind
         self._tick = tick
         self._least_inliers = max(kind.least_inliers, least_inliers)
-        self._features: dict[Seen, Features] = {}
+        self._features: dict[TurnedPhoto, Features] = {}
         self._turn: dict[int, int] = {}  # of posed photos that were found turned
-        self._places: dict[int, Floats] = {}  # photo -> (N, 3), NaN where a feature has no place
-        self._matches: dict[tuple[Seen, Seen], Pairs] = {}
-        self._alike: dict[tuple[Seen, Seen], int] = {}
-        self._failed: dict[Seen, list[int]] = {}  # what a photo was last compared with in vain
+        self._points: dict[int, Floats] = {}  # photo -> (N, 3), NaN where a feature has no place
+        self._matches: dict[tuple[TurnedPhoto, TurnedPhoto], Pairs] = {}
+        self._similarities: dict[tuple[TurnedPhoto, TurnedPhoto], int] = {}
+        self._failed: dict[TurnedPhoto, list[int]] = {}  # what a photo was last compared with in vain
         self.poses = dict(poses)
 
-    def _ready(self, photos: Iterable[int], turn: int = 0) -> None:
+    def _extract(self, photos: Iterable[int], turn: int = 0) -> None:
         missing = [p for p in photos if (p, turn) not in self._features]
         for photo, found in zip(missing, self._kind.extract([self._photos[p] for p in missing], turn), strict=True):
             self._features[photo, turn] = found
             self._tick()
 
-    def _posed(self, photo: int) -> Seen:
+    def _in_its_turn(self, photo: int) -> TurnedPhoto:
         return photo, self._turn.get(photo, 0)
 
-    def _match(self, pairs: Sequence[tuple[Seen, Seen]]) -> list[Pairs]:
+    def _match(self, pairs: Sequence[tuple[TurnedPhoto, TurnedPhoto]]) -> list[Pairs]:
         """Matches of each pair; what was matched before, either way around, is not matched again."""
         new = [p for p in pairs if p not in self._matches]
         found = self._kind.match([(self._features[a], self._features[b]) for a, b in new])
@@ -97,83 +97,86 @@ class Locator:
             self._tick()
         return [self._matches[p] for p in pairs]
 
-    def _likeness(self, a: Seen, b: Seen) -> int:
-        """How many descriptors agree, places aside: cheap, where a learned matcher is dear."""
-        if (a, b) not in self._alike:
+    def _similarity(self, a: TurnedPhoto, b: TurnedPhoto) -> int:
+        """How many descriptors agree, places aside: cheap, where a learned matcher is expensive."""
+        if (a, b) not in self._similarities:
             # Where the kind matches by descriptors alone, this is its match.
             plain = self._kind.shortlist is None
             count = len(self._match([(a, b)])[0] if plain else match(self._features[a], self._features[b]))
-            self._alike[a, b] = self._alike[b, a] = count
-        return self._alike[a, b]
+            self._similarities[a, b] = self._similarities[b, a] = count
+        return self._similarities[a, b]
 
-    def _place(self, photos: Iterable[int]) -> None:
+    def _triangulate_features(self, photos: Iterable[int]) -> None:
         """Triangulate the features of posed photos with their neighbours, once."""
         order = tuple(sorted(self.poses))
         poses = tuple(self.poses[p] for p in order)
-        new = [p for p in photos if p not in self._places]
+        new = [p for p in photos if p not in self._points]
         if not new:
             return
-        near = choose_pairs(poses, self._target, DepthSettings(pairs_per_photo=PLACING_PARTNERS))
+        near = choose_pairs(poses, self._target, DepthSettings(pairs_per_photo=TRIANGULATION_PARTNERS))
         partners = {a: [order[j] for i, j in near if order[i] == a] for a in new}
-        self._ready(p for p in {q for b in partners.values() for q in b} | set(new) if p not in self._turn)
+        self._extract(p for p in {q for b in partners.values() for q in b} | set(new) if p not in self._turn)
         pairs = []
         for a, others in partners.items():
-            self._places[a] = np.full((len(self._features[self._posed(a)].xy), 3), np.nan)
-            known = [b for b in others if (self._posed(a), self._posed(b)) in self._matches]
+            self._points[a] = np.full((len(self._features[self._in_its_turn(a)].xy), 3), np.nan)
+            known = [b for b in others if (self._in_its_turn(a), self._in_its_turn(b)) in self._matches]
             pairs += [(a, b) for b in known or others[:2]]
-        found = self._match([(self._posed(a), self._posed(b)) for a, b in pairs])
+        found = self._match([(self._in_its_turn(a), self._in_its_turn(b)) for a, b in pairs])
         for (a, b), matches in zip(pairs, found, strict=True):
             self._triangulate(a, b, matches)
 
     def _triangulate(self, a: int, b: int, pairs: Pairs) -> None:
         if not len(pairs):
             return
-        xy = self._features[self._posed(a)].xy[pairs[:, 0]], self._features[self._posed(b)].xy[pairs[:, 1]]
+        xy = self._features[self._in_its_turn(a)].xy[pairs[:, 0]], self._features[self._in_its_turn(b)].xy[pairs[:, 1]]
         points, good = triangulate_pair(self._lens, (self.poses[a], self.poses[b]), xy)
-        self._places[a][pairs[good, 0]] = points[good]
-        if b in self._places:
-            self._places[b][pairs[good, 1]] = points[good]
+        self._points[a][pairs[good, 0]] = points[good]
+        if b in self._points:
+            self._points[b][pairs[good, 1]] = points[good]
 
-    def near(self, poses: Iterable[Pose]) -> set[int]:
+    def nearest_by_direction(self, poses: Iterable[Pose]) -> set[int]:
         """The posed photos that look from about where a photo with one of ``poses`` would."""
         known = np.array(sorted(self.poses))
-        sights = np.stack([self._sight(self.poses[int(p)]) for p in known])
-        return {int(p) for pose in poses for p in known[np.argsort(-(sights @ self._sight(pose)))[:NEAREST]]}
+        sights = np.stack([self._viewing_direction(self.poses[int(p)]) for p in known])
+        towards = [sights @ self._viewing_direction(pose) for pose in poses]
+        return {int(p) for cosine in towards for p in known[np.argsort(-cosine)[:NEAREST]]}
 
-    def _sight(self, pose: Pose) -> Floats:
+    def _viewing_direction(self, pose: Pose) -> Floats:
         away = pose.centre - self._target
         return np.asarray(away / np.linalg.norm(away))
 
-    def easiest_first(self, photos: Sequence[int]) -> list[int]:
+    def most_similar_first(self, photos: Sequence[int]) -> list[int]:
         """``photos`` by how much they look like the posed photo that looks most like them."""
-        self._place(self.poses)
-        self._ready(photos)
+        self._triangulate_features(self.poses)
+        self._extract(photos)
         alike: dict[int, int] = {}
         for p in photos:
-            alike[p] = max(self._likeness((p, 0), self._posed(q)) for q in self.poses)
+            alike[p] = max(self._similarity((p, 0), self._in_its_turn(q)) for q in self.poses)
             self._tick()
         return sorted(photos, key=lambda p: (-alike[p], p))
 
-    def locate(self, photo: int, among: set[int] | None = None, *, turned: bool = False) -> Located | None:
+    def locate(self, photo: int, among: set[int] | None = None, *, turned: bool = False) -> ResectedPose | None:
         """Resect a photo against the posed photos ``among``, all by default; None where too few matches agree.
 
         ``turned``: in the other quarter turns, where the kind of features does not see through them.
         """
         others = set(self.poses) - {photo} if among is None else among - {photo}
-        self._place(others)
+        self._triangulate_features(others)
         if not turned:
             return self._resect(photo, 0, others)
         alike = {}
         for turn in self._kind.turns:
-            self._ready([photo], turn)
-            alike[turn] = max(self._likeness((photo, turn), self._posed(p)) for p in others)
+            self._extract([photo], turn)
+            alike[turn] = max(self._similarity((photo, turn), self._in_its_turn(p)) for p in others)
         turn = max(alike, key=lambda k: (alike[k], -k))
         return self._resect(photo, turn, others) if turn else None
 
-    def _resect(self, photo: int, turn: int, others: set[int]) -> Located | None:
-        self._ready([photo], turn)
+    def _resect(self, photo: int, turn: int, others: set[int]) -> ResectedPose | None:
+        self._extract([photo], turn)
         mine = (photo, turn)
-        chosen = sorted(others, key=lambda p: (-self._likeness(mine, self._posed(p)), p))[: self._kind.shortlist]
+        chosen = sorted(others, key=lambda p: (-self._similarity(mine, self._in_its_turn(p)), p))[
+            : self._kind.shortlist
+        ]
         if self._failed.get(mine) == chosen:
             return None
         located = self._pose_from(mine, chosen)
@@ -181,11 +184,11 @@ class Locator:
             self._failed[mine] = chosen
         return located
 
-    def _pose_from(self, mine: Seen, chosen: list[int]) -> Located | None:
+    def _pose_from(self, mine: TurnedPhoto, chosen: list[int]) -> ResectedPose | None:
         features = self._features[mine]
         xy, places = [np.zeros((0, 2))], [np.zeros((0, 3))]
-        for other, pairs in zip(chosen, self._match([(mine, self._posed(p)) for p in chosen]), strict=True):
-            at = self._places[other][pairs[:, 1]]
+        for other, pairs in zip(chosen, self._match([(mine, self._in_its_turn(p)) for p in chosen]), strict=True):
+            at = self._points[other][pairs[:, 1]]
             placed = np.isfinite(at).all(1)
             xy.append(features.xy[pairs[placed, 0]])
             places.append(at[placed])
@@ -209,7 +212,7 @@ class Locator:
         pose = Pose(matrix[:, :3].copy(), matrix[:, 3].copy())
         if pose.centre[2] <= self._target[2]:
             return None  # it would look from below the specimen
-        return Located(pose, inliers, inliers / len(points_2d), mine[1])
+        return ResectedPose(pose, inliers, inliers / len(points_2d), mine[1])
 
     def add(self, photo: int, pose: Pose, turn: int = 0) -> None:
         """Count a photo as posed; its features, described in that quarter turn, take part from now on."""
@@ -217,8 +220,8 @@ class Locator:
         if turn:
             self._turn[photo] = turn
 
-    def counts(self) -> tuple[list[int], list[int]]:
+    def feature_counts(self) -> tuple[list[int], list[int]]:
         """Features of each photo looked at, and how many of them have a place, for each posed photo."""
         found = [len(f.xy) for (_, turn), f in self._features.items() if not turn]
-        placed = [int(np.isfinite(p).all(1).sum()) for p in self._places.values()]
+        placed = [int(np.isfinite(p).all(1).sum()) for p in self._points.values()]
         return found, placed

@@ -1,4 +1,4 @@
-"""Poses from single squares: two each, of which the photo's other markers choose one; and who agrees with whom."""
+"""Poses from single squares: two each, of which the photo's other markers choose one; and the largest consensus."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ Tick = Callable[[], None]
 
 @dataclass(frozen=True)
 class Motion:
-    """``poses``: ``cam_from_world`` of the photos that hang together, by their index, in any frame and scale."""
+    """``poses``: ``cam_from_world`` of the connected photos, by their index, in any frame and scale."""
 
     lens: Intrinsics
     poses: dict[int, Pose]
@@ -69,7 +69,7 @@ class Motion:
 def structure_from_motion(
     photos: list[Photo], kind: FeatureKind, focal_px: float | None, *, seed: int, workers: int, tick: Tick
 ) -> Motion | None:
-    """Poses of the largest set of photos (of one size) that hang together; None where that is fewer than three.
+    """Poses of the largest set of connected photos (of one size); None where that is fewer than three.
 
     ``focal_px``: from EXIF. ``tick`` is called between steps; what it raises ends the work.
     """

@@ -1,9 +1,8 @@
-"""The report's figures at the markers, and the comparison of a cloud with independent truth."""
+"""The report's figures of accuracy at the markers."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from specimap_core.errors import SpecimapError
 from specimap_core.geometry.cameras import Floats, View
 from specimap_core.register.camera_fitting import refit
+from specimap_core.register.corners import CornersInCube
 from specimap_core.register.placement import fit_homography
 from specimap_core.render.orthographic import Grid
 from specimap_core.report.model import LeaveOneOut, MethodFigures, Quartiles, Spread
@@ -29,26 +29,6 @@ def quartiles(values: Floats) -> Quartiles:
         return Quartiles(median=float("nan"), q1=float("nan"), q3=float("nan"), n=0)
     q1, median, q3 = np.percentile(finite, [25, 50, 75])
     return Quartiles(median=float(median), q1=float(q1), q3=float(q3), n=finite.size)
-
-
-@dataclass(frozen=True)
-class CornersInCube:
-    """What the figures are computed from: ``corners`` (Q, 4, 3) mm, their places ``corners_px`` (Q, 4, 2) in the
-    cube (columns as the camera saw them) and ``sigma_px`` (Q,), with the ids."""
-
-    marker_ids: tuple[int, ...]
-    corners: Floats
-    corners_px: Floats
-    sigma_px: Floats
-
-    def flat(self, keep: NDArray[np.bool_] | None = None) -> tuple[Floats, Floats, Floats]:
-        """Corners (N, 3), pixels (N, 2), sigma (N,) of the markers in ``keep``, of all by default."""
-        chosen = slice(None) if keep is None else keep
-        return (
-            self.corners[chosen].reshape(-1, 3),
-            self.corners_px[chosen].reshape(-1, 2),
-            np.repeat(self.sigma_px[chosen], 4),
-        )
 
 
 def on_plane(view: View, pixels: Floats, heights: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""A camera of any model fitted to marker corners, and to where tiles of the specimen show."""
+"""Fit a camera of any model to marker corners, and to tiles of the specimen."""
 
 from __future__ import annotations
 
@@ -10,16 +10,23 @@ from scipy.optimize import least_squares
 from specimap_core.geometry.cameras import Floats, View, rotation_from_vector
 from specimap_core.geometry.pushbroom import ScanView
 from specimap_core.geometry.robust import SIGMA_OF_MAD
-from specimap_core.register.camera_models import STEPS, Model, at_markers, model_of, moved, priors
+from specimap_core.register.camera_models import (
+    PARAMETER_SCALES,
+    Model,
+    apply_step,
+    at_markers,
+    model_of,
+    prior_residuals,
+)
 from specimap_core.register.cube_camera import LEAST_SCATTER, CubeCamera, solve_camera
-from specimap_core.register.tile_offsets import Sighting
+from specimap_core.register.tile_offsets import TileOffsets
 
-MOTION_STEPS = np.array([0.1, 0.1, 0.01])
-"""What a shift in mm and a turn in rad usually change by."""
+MOTION_SCALES = np.array([0.1, 0.1, 0.01])
+"""Typical change of a shift in mm and a turn in rad."""
 
 
 @dataclass(frozen=True)
-class Tissue:
+class TileObservations:
     """Where the specimen shows: ``points`` (T, S, 3) mm of each tile, their mean place ``pixels`` (T, 2) in the cube as
     found, and its ``sigma_px`` (2,)."""
 
@@ -28,12 +35,12 @@ class Tissue:
     sigma_px: Floats
 
     @staticmethod
-    def of(sighting: Sighting, sigma_mm: float) -> Tissue:
-        """Of the tiles that say something."""
-        kept = np.isfinite(sighting.offsets[:, 0]) & (sighting.weight > 0)
-        points = sighting.points[kept]
-        pixels = sighting.view.project(points).mean(1) + sighting.offsets[kept] / sighting.scale
-        return Tissue(points, pixels, sigma_mm / sighting.view.mm_per_px(sighting.depth_mm))
+    def of(measured: TileOffsets, sigma_mm: float) -> TileObservations:
+        """Take the tiles that have an offset, each axis with a standard deviation of ``sigma_mm``."""
+        kept = np.isfinite(measured.offsets[:, 0]) & (measured.weight > 0)
+        points = measured.points[kept]
+        pixels = measured.view.project(points).mean(1) + measured.offsets[kept] / measured.scale
+        return TileObservations(points, pixels, sigma_mm / measured.view.mm_per_px(measured.depth_mm))
 
     def miss(self, view: View, motion: Floats) -> Floats:
         """By how many standard deviations (T, 2) ``view`` expects it elsewhere, the specimen shifted by ``motion[:2]``
@@ -47,55 +54,57 @@ class Tissue:
 
 
 @dataclass(frozen=True)
-class Sight:
-    """What is seen in the cube: ``corners`` (N, 3) mm at ``pixels`` (N, 2) with ``sigma_px`` (N,), and ``tissue``."""
+class CubeObservations:
+    """Observations in the cube: ``corners`` (N, 3) mm at ``pixels`` (N, 2) with ``sigma_px`` (N,), and ``tiles``."""
 
     corners: Floats
     pixels: Floats
     sigma_px: Floats
-    tissue: Tissue | None = None
+    tiles: TileObservations | None = None
 
-    def looser(self, factor: float) -> Sight:
-        """The same with corners less sure."""
+    def with_inflated_corner_sigma(self, factor: float) -> CubeObservations:
+        """The same with the corners' standard deviations ``factor`` times as large."""
         return replace(self, sigma_px=self.sigma_px * factor)
 
-    def with_looser_tissue(self, factor: float) -> Sight:
-        """The same with the specimen's tiles less sure."""
-        tissue = self.tissue
-        return self if tissue is None else replace(self, tissue=replace(tissue, sigma_px=tissue.sigma_px * factor))
+    def with_inflated_tile_sigma(self, factor: float) -> CubeObservations:
+        """The same with the tiles' standard deviations ``factor`` times as large."""
+        tiles = self.tiles
+        return self if tiles is None else replace(self, tiles=replace(tiles, sigma_px=tiles.sigma_px * factor))
 
 
 @dataclass(frozen=True)
-class Fit:
-    """A ``camera`` fitted: ``cost``, chi squared of what is seen and of priors, robust; ``motion`` (3,): shift mm and
-    turn rad of the specimen, zero where it was taken to have stayed; ``scatter``: root mean square of the corners'
-    residuals in standard deviations, ``spared``: by what fitting made them smaller; ``tile_miss`` (T, 2) of the tiles'
-    in theirs."""
+class CameraFit:
+    """A ``camera`` fitted to what was ``observed``.
+
+    ``cost``: robust chi squared of the observations and priors; ``motion`` (3,): shift mm and turn rad of the specimen,
+    zero where it was taken to have stayed; ``scatter``: root mean square of the corners' residuals in standard
+    deviations; ``dof_factor``: root of observations over degrees of freedom, by which fitting makes residuals smaller;
+    ``tile_miss`` (T, 2): residuals of the tiles in their standard deviations.
+    """
 
     camera: CubeCamera
-    sight: Sight
+    observed: CubeObservations
     cost: float
     motion: Floats
     scatter: float
-    spared: float
+    dof_factor: float
     tile_miss: Floats
 
     @property
     def tile_mm(self) -> float:
-        """How far tiles show from where the camera expects them, sideways, as a robust root mean square; 0 of none."""
-        if self.sight.tissue is None:
+        """Robust root mean square of the tiles' residuals at the specimen, mm; 0 without tiles."""
+        if self.observed.tiles is None:
             return 0.0
-        miss_mm = self.tile_miss * self.sight.tissue.sigma_px * self.camera.span_mm
+        miss_mm = self.tile_miss * self.observed.tiles.sigma_px * self.camera.span_mm
         return float(np.sqrt(2) * SIGMA_OF_MAD * np.median(np.abs(miss_mm)))
 
 
-POSE = 6
-"""How many of a model's numbers say where the camera stands."""
+POSE_PARAMETERS = 6
+"""Number of a model's parameters, from the first, that are its pose."""
 
 
 def refit(view: View, corners: Floats, pixels: Floats, sigma_px: Floats) -> View:
-    """``view`` moved to where it sees ``corners`` (N, 3) mm best at ``pixels`` (N, 2) with ``sigma_px`` (N,); all else
-    stays.
+    """Fit the pose of ``view`` alone to ``corners`` (N, 3) mm at ``pixels`` (N, 2) with ``sigma_px`` (N,).
 
     Raises:
         RegistrationError: no camera above the plane sees the corners there.
@@ -103,30 +112,32 @@ def refit(view: View, corners: Floats, pixels: Floats, sigma_px: Floats) -> View
     lens = view.intrinsics
     if not isinstance(view, ScanView) and lens.aspect == 1:
         return solve_camera(corners, pixels, sigma_px, lens.height, lens.width, focal_px=lens.focal_px).view
-    return fit(view, model_of(view), Sight(corners, pixels, sigma_px), held=POSE).camera.view
+    return fit(view, model_of(view), CubeObservations(corners, pixels, sigma_px), free=POSE_PARAMETERS).camera.view
 
 
-def fit(start: View, model: Model, sight: Sight, *, motion: bool = False, held: int | None = None) -> Fit:
-    """Fit ``model`` from ``start``; with ``motion`` the specimen may have moved; the first ``held`` of the model's
-    numbers are free where given."""
-    free = model.free if held is None else held
+def fit(
+    start: View, model: Model, observed: CubeObservations, *, motion: bool = False, free: int | None = None
+) -> CameraFit:
+    """Fit ``model`` from ``start``; with ``motion`` the specimen may have moved. ``free``: how many of the model's
+    parameters are free, from the first; all by default."""
+    free = model.free if free is None else free
     many = free + (3 if motion else 0)
-    weight = 1 / np.maximum(sight.sigma_px, 1e-3)[:, None]
-    corners, tissue = 2 * len(sight.corners), sight.tissue
+    weight = 1 / np.maximum(observed.sigma_px, 1e-3)[:, None]
+    corners, tiles = 2 * len(observed.corners), observed.tiles
 
     def residual(x: Floats, base: View) -> Floats:
-        view = moved(base, x[:free])
-        parts = [((view.project(sight.corners) - sight.pixels) * weight).ravel(), np.array(priors(view))]
-        if tissue is not None:
-            parts.append(tissue.miss(view, x[free:] if motion else np.zeros(3)).ravel())
+        view = apply_step(base, x[:free])
+        parts = [((view.project(observed.corners) - observed.pixels) * weight).ravel(), np.array(prior_residuals(view))]
+        if tiles is not None:
+            parts.append(tiles.miss(view, x[free:] if motion else np.zeros(3)).ravel())
         return np.concatenate(parts)
 
     def robust(z: Floats) -> Floats:
-        """Corners lie off by a little more than said, tiles at times by a lot."""
+        """Soft L1 for corners, which err a little more than stated; Cauchy for tiles, some of which are far off."""
         rho = np.empty((3, len(z)))
         root = np.sqrt(1 + z)
         rho[0], rho[1], rho[2] = 2 * (root - 1), 1 / root, -0.5 / root**3
-        far = slice(corners + len(priors(start)), None)
+        far = slice(corners + len(prior_residuals(start)), None)
         rho[0, far], rho[1, far], rho[2, far] = np.log1p(z[far]), 1 / (1 + z[far]), -1 / (1 + z[far]) ** 2
         return rho
 
@@ -136,14 +147,14 @@ def fit(start: View, model: Model, sight: Sight, *, motion: bool = False, held: 
             residual,
             x,
             args=(base,),
-            x_scale=np.append(STEPS[:free], MOTION_STEPS[: many - free]),
+            x_scale=np.append(PARAMETER_SCALES[:free], MOTION_SCALES[: many - free]),
             loss=robust,
         )
         # Once more from there: steps and covariance are then about the camera that is given.
-        base, x = at_markers(moved(base, answer.x[:free])), np.append(np.zeros(free), answer.x[free:])
-    miss = base.project(sight.corners) - sight.pixels
+        base, x = at_markers(apply_step(base, answer.x[:free])), np.append(np.zeros(free), answer.x[free:])
+    miss = base.project(observed.corners) - observed.pixels
     scatter = float(((miss * weight) ** 2).sum()) / max(corners - free, 1)
-    spared = float(np.sqrt(corners / max(corners - free, 1)))
+    dof_factor = float(np.sqrt(corners / max(corners - free, 1)))
     covariance = (np.linalg.pinv(answer.jac.T @ answer.jac) * max(LEAST_SCATTER, scatter))[:free, :free]
     camera = CubeCamera(
         base,
@@ -153,5 +164,5 @@ def fit(start: View, model: Model, sight: Sight, *, motion: bool = False, held: 
         model,
     )
     shift = x[free:] if motion else np.zeros(3)
-    tiles = tissue.miss(base, shift) if tissue is not None else np.empty((0, 2))
-    return Fit(camera, sight, float(2 * answer.cost), shift, float(np.sqrt(scatter)), spared, tiles)
+    tile_miss = tiles.miss(base, shift) if tiles is not None else np.empty((0, 2))
+    return CameraFit(camera, observed, float(2 * answer.cost), shift, float(np.sqrt(scatter)), dof_factor, tile_miss)

@@ -1,7 +1,7 @@
-"""What may have recorded a cube, as parameters about a given view, and where a solution of each starts.
+"""Camera models of a cube, as parameters about a given view, and where a solution of each starts.
 
-Ten numbers describe all of them: a turn, a shift, the logarithms of the focal length and of the pixel's aspect, and of
-a scan its skew and climb. A frame camera of square pixels has the first seven.
+Ten parameters describe all of them: a turn, a shift, the logarithms of the focal length and of the pixel's aspect, and
+of a scan its skew and climb. A frame camera of square pixels has the first seven.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ SKEW_SD = 0.05
 """Of a scan's motion from square to its line, rad."""
 ASPECT_RANGE = (0.25, 4.0)
 """Heights over widths of a pixel that are believed."""
-PRICED = 8.0
-"""How much better than a frame camera of square pixels another must explain what is seen, in chi squared."""
-NUMBERS = 10
-STEPS = np.array([1e-3] * 3 + [1.0] * 3 + [0.1, 0.01, 0.01, 0.01])
-"""What each number usually changes by."""
+MODEL_PENALTY = 8.0
+"""Chi squared that another model must gain over a frame camera of square pixels."""
+PARAMETERS = 10
+PARAMETER_SCALES = np.array([1e-3] * 3 + [1.0] * 3 + [0.1, 0.01, 0.01, 0.01])
+"""Typical change of each parameter."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """A ``kind`` of camera; ``free``: how many of the ten numbers it has, from the first; ``priced``: what it must gain
-    over a frame camera of square pixels."""
+    """A ``kind`` of camera; ``free``: how many of the ten parameters it has, from the first; ``penalty``: chi squared
+    that it must gain over a frame camera of square pixels."""
 
     kind: Kind
     free: int
-    priced: float
+    penalty: float
 
     @property
     def scan(self) -> Axis | None:
@@ -60,8 +60,8 @@ class Model:
 
 
 FRAME = Model("frame", 7, 0.0)
-ASPECT = Model("frame_aspect", 8, PRICED)
-SCANS = Model("scan_rows", NUMBERS, PRICED), Model("scan_columns", NUMBERS, PRICED)
+ASPECT = Model("frame_aspect", 8, MODEL_PENALTY)
+SCANS = Model("scan_rows", PARAMETERS, MODEL_PENALTY), Model("scan_columns", PARAMETERS, MODEL_PENALTY)
 
 
 def model_of(view: View) -> Model:
@@ -71,10 +71,10 @@ def model_of(view: View) -> Model:
     return FRAME if view.intrinsics.aspect == 1 else ASPECT
 
 
-def moved(view: View, x: Floats) -> View:
+def apply_step(view: View, x: Floats) -> View:
     """``view`` turned by ``x[:3]``, shifted by ``x[3:6]``, its focal length ``exp(x[6])`` as long and its distance with
     it; its pixels ``exp(x[7])`` as high; with ``x[8]`` more skew and ``x[9]`` more climb."""
-    x = np.append(x, np.zeros(NUMBERS - len(x)))
+    x = np.append(x, np.zeros(PARAMETERS - len(x)))
     lens, pose = view.intrinsics, view.cam_from_world
     zoom, higher = (float(v) for v in np.exp(x[6:8]))
     turned = rotation_from_vector(x[:3]) @ pose.R
@@ -106,8 +106,8 @@ def at_markers(view: View) -> View:
     return replace(view, intrinsics=lens, depth_mm=depth)
 
 
-def priors(view: View) -> list[float]:
-    """What ``view`` departs by from what is usual, in standard deviations."""
+def prior_residuals(view: View) -> list[float]:
+    """Departures of ``view`` from what is usual, in standard deviations."""
     lens, pose = view.intrinsics, view.cam_from_world
     usual = float(np.sqrt(FOCAL_RANGE[0] * FOCAL_RANGE[1])) * max(lens.width, lens.height)
     off = [float(np.log(lens.focal_px / usual)) / FOCAL_PRIOR_SD]
@@ -120,14 +120,14 @@ def priors(view: View) -> list[float]:
 
 
 @dataclass(frozen=True)
-class Flat:
+class PlaneAffinity:
     """The corners' plane in the cube as an affine map: pixels are ``A @ (x, y) + b``."""
 
     A: Floats
     b: Floats
 
     @staticmethod
-    def of(corners: Floats, pixels: Floats) -> Flat:
+    def of(corners: Floats, pixels: Floats) -> PlaneAffinity:
         """Least squares over corners (N, 3) and pixels (N, 2).
 
         Raises:
@@ -139,7 +139,7 @@ class Flat:
                 "No camera above the markers sees them as the cube does.",
                 advice="Check that cube and photos show the same, unmoved markers.",
             )
-        return Flat(np.asarray(answer[:, :2], float), np.asarray(answer[:, 2], float))
+        return PlaneAffinity(np.asarray(answer[:, :2], float), np.asarray(answer[:, 2], float))
 
     @property
     def aspect(self) -> float:

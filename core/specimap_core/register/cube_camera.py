@@ -17,12 +17,12 @@ from scipy.optimize import least_squares
 from specimap_core.errors import RegistrationError
 from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, View, rotation_from_vector
 from specimap_core.geometry.pushbroom import ScanView
-from specimap_core.register.camera_models import FOCAL_PRIOR_SD, FOCAL_RANGE, FRAME, Model, moved
+from specimap_core.register.camera_models import FOCAL_PRIOR_SD, FOCAL_RANGE, FRAME, Model, apply_step
 
 FOCAL_STARTS = 24
 LEAST_SCATTER = 0.5
 """Corners fit together better than they lie, by chance and since their errors share parts: their variance is not taken
-for less than this share of what was said."""
+for less than this share of what their standard deviations state."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Anchor:
 @dataclass(frozen=True)
 class CubeCamera:
     """The solved camera: ``view``; RMS corner distance ``rms_px``; ``focal_sd``: one standard deviation of the
-    logarithm of the focal length, as the corners determine it; ``covariance`` (n, n) of the ``model``'s numbers,
-    rotation, translation and log focal length first (:func:`specimap_core.register.camera_models.moved`)."""
+    logarithm of the focal length, as the corners determine it; ``covariance`` (n, n) of the ``model``'s parameters,
+    rotation, translation and log focal length first (:func:`specimap_core.register.camera_models.apply_step`)."""
 
     view: View
     rms_px: float
@@ -46,13 +46,14 @@ class CubeCamera:
     covariance: Floats
     model: Model = FRAME
 
-    def sideways_mm(self, points: Floats) -> float:
-        """Sideways standard deviation of what is registered at ``points`` (N, 3) mm, root mean square: how far they
-        would move in the cube within what the corners leave open of the camera."""
+    def lateral_sd_mm(self, points: Floats) -> float:
+        """Lateral standard deviation at ``points`` (N, 3) mm, root mean square: the camera's covariance propagated to
+        where the cube shows them."""
         step = 1e-4
         J = np.stack(
             [
-                (moved(self.view, step * e).project(points) - moved(self.view, -step * e).project(points)) / (2 * step)
+                (apply_step(self.view, step * e).project(points) - apply_step(self.view, -step * e).project(points))
+                / (2 * step)
                 for e in np.eye(len(self.covariance))
             ],
             -1,
@@ -138,7 +139,7 @@ def _refine(
     off = float(np.log(lens.focal_px / usual))
 
     def unpack(x: Floats) -> View:
-        return moved(start, x if free_focal else np.append(x[:6], 0.0))
+        return apply_step(start, x if free_focal else np.append(x[:6], 0.0))
 
     def residual(x: Floats) -> Floats:
         view = unpack(x)

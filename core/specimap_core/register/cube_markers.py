@@ -1,4 +1,4 @@
-"""Markers in the cube: in the band mean, else in bands where they show; mirrored cubes are recognised."""
+"""Find markers in the cube: in the band mean, else in bands where they show; mirrored cubes are recognised."""
 
 from __future__ import annotations
 
@@ -72,6 +72,16 @@ class CubeMarkers:
     image: NDArray[np.float32]
     where: str
     mirrored: bool
+
+
+def unmirrored(pixels: Floats, mirrored: bool, cols: int) -> Floats:
+    """Pixels (..., 2) x, y of a cube of ``cols`` columns as its camera saw them, or those of the camera as the cube's:
+    the same, with x counted from the other side where the cube is ``mirrored``."""
+    if not mirrored:
+        return pixels
+    flipped = pixels.copy()
+    flipped[..., 0] = cols - 1 - flipped[..., 0]
+    return flipped
 
 
 def cleaned(image: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -172,9 +182,7 @@ def find_markers(cube: Bands, dictionary: str, known: tuple[int, ...]) -> CubeMa
             seen=ids,
             wanted=list(known),
         )
-    corners = np.stack([d.corners_px for d in found])
-    if mirrored:
-        corners[..., 0] = cube.cols - 1 - corners[..., 0]
+    corners = unmirrored(np.stack([d.corners_px for d in found]), mirrored, cube.cols)
     return CubeMarkers(tuple(ids), corners, np.array([d.sigma_px for d in found]), image, where, mirrored)
 
 

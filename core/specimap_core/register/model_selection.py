@@ -1,7 +1,7 @@
-"""Which kind of camera recorded the cube: what the markers' corners say, and the specimen between them.
+"""Select the camera model of a cube by the markers' corners and the specimen between them.
 
 Corners in one plane show a push-broom much as a frame camera, and a slower scan much as a camera that looks aslant.
-What differs is how far raised tissue leans, and to which side. So every kind is fitted to corners and tiles of the
+What differs is how far raised tiles leans, and to which side. So every kind is fitted to corners and tiles of the
 specimen together, once with a specimen that stayed and once with one that moved, and the simplest is taken unless
 another explains clearly more.
 """
@@ -16,104 +16,121 @@ import numpy as np
 from specimap_core.errors import RegistrationError
 from specimap_core.geometry.cameras import Floats, View
 from specimap_core.geometry.robust import SIGMA_OF_MAD
-from specimap_core.register.camera_fitting import Fit, Sight, Tissue, fit
-from specimap_core.register.camera_models import ASPECT, ASPECT_RANGE, FRAME, SCANS, Flat, Model, in_square_pixels
+from specimap_core.register.camera_fitting import CameraFit, CubeObservations, TileObservations, fit
+from specimap_core.register.camera_models import (
+    ASPECT,
+    ASPECT_RANGE,
+    FRAME,
+    SCANS,
+    Model,
+    PlaneAffinity,
+    in_square_pixels,
+)
 from specimap_core.register.cube_camera import CubeCamera, solve_camera
-from specimap_core.register.tile_offsets import Sighting
+from specimap_core.register.tile_offsets import TileOffsets
 
 FOCAL_START = 5.0
 """Of a scan's camera, in widths of the cube."""
-MOTION_PRICED = 20.0
-"""How much better a specimen that moved must explain what is seen, in chi squared."""
+MOTION_PENALTY = 20.0
+"""Chi squared that a specimen that moved must gain over one that stayed."""
 TILE_MM, LEAST_TILE_MM = 0.1, 0.03
 """Standard deviation of a tile's place at first, and the least that is believed."""
-SHARED_BY_TILES = 3.0
-"""How much less sure a tile is where a camera is measured by it than where kinds are compared: the surface is off by as
-much over several tiles alike, which their scatter does not show."""
+SHARED_TILE_ERROR = 3.0
+"""Factor on a tile's standard deviation where it measures a camera, not where models are compared: several tiles share
+an error of the surface, which their scatter does not show."""
 LEAST_TILES = 5
-LOOKS = 3
-BETWEEN_CORNERS = 1.5
-"""How much farther off the cube is taken to be between markers than at them, where no camera fits."""
-UNFIT, UNFIT_MM = 3.0, 0.05
+ROUNDS = 3
+MISFIT_BETWEEN_CORNERS = 1.5
+"""Misfit between markers over that at them, where no camera fits."""
+MISFIT, MISFIT_MM = 3.0, 0.05
 """Corners that lie so much farther than they should from where the best camera sees them, and farther than this, fit
 no camera."""
-SETTLED_MM = 0.02
-"""Looks end when the specimen's expected place changes by less."""
-OPEN = 9.0
+CONVERGED_MM = 0.02
+"""Rounds end when the specimen's expected place changes by less."""
+NOT_RULED_OUT = 9.0
 """A kind that explains less by no more than this, in chi squared, is not ruled out."""
-DOUBTED = 3.0
+IN_DOUBT = 3.0
 """A frame camera of square pixels is in doubt where another explains more by this: numbers that it lacks explain one or
 two by chance."""
 
-Look = Callable[[View], Sighting | None]
+MeasureOffsets = Callable[[View], TileOffsets | None]
 
 
 @dataclass(frozen=True)
-class Choice:
-    """The ``model`` taken and its ``fit``; ``alone``: the same fitted to the corners alone; ``moved``: the specimen
-    lies elsewhere; ``sighting``: what the specimen last showed, through whichever camera; ``open_mm``: how far the
-    kinds that are not ruled out put the specimen apart, sideways, weighted by how likely they are."""
+class SelectedCamera:
+    """The ``model`` selected and its ``fit``; ``by_corners``: the same fitted to the corners alone; ``moved``: the
+    specimen lies elsewhere; ``tile_offsets``: the last that were measured, through whichever camera; ``ambiguity_mm``:
+    lateral distance between where the models that are not ruled out put the specimen, weighted by their likelihood."""
 
     model: Model
-    fit: Fit
-    alone: Fit
+    fit: CameraFit
+    by_corners: CameraFit
     moved: bool
-    sighting: Sighting | None
-    open_mm: float
+    tile_offsets: TileOffsets | None
+    ambiguity_mm: float
 
     @property
-    def unfit_mm(self) -> float:
-        """How far cube and best camera contradict, where the corners do so by more than they may, else 0."""
-        camera = self.alone.camera
-        corners_mm = camera.rms_px * camera.pixel_mm * self.alone.spared
-        if self.alone.scatter < UNFIT or corners_mm < UNFIT_MM:
+    def misfit_mm(self) -> float:
+        """Residual of the best camera, where the corners contradict it by more than they may, else 0."""
+        camera = self.by_corners.camera
+        corners_mm = camera.rms_px * camera.pixel_mm * self.by_corners.dof_factor
+        if self.by_corners.scatter < MISFIT or corners_mm < MISFIT_MM:
             return 0.0
         # Corners say nothing of what the scan did between them.
-        return max(corners_mm * BETWEEN_CORNERS, self.fit.tile_mm)
+        return max(corners_mm * MISFIT_BETWEEN_CORNERS, self.fit.tile_mm)
 
     @property
-    def by_specimen(self) -> bool:
-        """Whether the specimen had a say."""
+    def specimen_used(self) -> bool:
+        """Whether tiles of the specimen took part in the fit."""
         return len(self.fit.tile_miss) > 0
 
 
-def choose_camera(sight: Sight, rows: int, cols: int, square: CubeCamera | None, places: Floats, look: Look) -> Choice:
-    """Choose between all kinds of camera for a cube of ``rows`` and ``cols``.
+def select_camera(
+    observed: CubeObservations,
+    rows: int,
+    cols: int,
+    square: CubeCamera | None,
+    places: Floats,
+    measure: MeasureOffsets,
+) -> SelectedCamera:
+    """Select among all kinds of camera for a cube of ``rows`` and ``cols``.
 
     ``square``: the frame camera of square pixels solved on the corners, if there is one; ``places`` (N, 3) mm of the
-    specimen's surface; ``look``: finds the specimen through a camera.
+    specimen's surface; ``measure``: measures the tiles' offsets through a camera.
 
     Raises:
         RegistrationError: no kind of camera sees the corners there.
     """
-    starts = _starts(sight, rows, cols, square)
-    alone = {model: fit(view, model, sight) for model, view in starts.items()}
+    starts = _starts(observed, rows, cols, square)
+    by_corners = {model: fit(view, model, observed) for model, view in starts.items()}
     # Corners err together with the layout: what the best kind leaves of them is how far they can be trusted.
-    sight = sight.looser(max(1.0, min(f.scatter for f in alone.values())))
-    now = {(model, False): fit(f.camera.view, model, sight) for model, f in alone.items()}
+    observed = observed.with_inflated_corner_sigma(max(1.0, min(f.scatter for f in by_corners.values())))
+    now = {(model, False): fit(f.camera.view, model, observed) for model, f in by_corners.items()}
     best = _cheapest(now)
-    seen: Sighting | None = None
-    for _ in range(LOOKS):
+    seen: TileOffsets | None = None
+    for _ in range(ROUNDS):
         through = now[best].camera.view
         if seen is None and best[0] is FRAME and square is not None:
             through = square.view
-        found = _first_sighting(look, [through, *(f.camera.view for f in now.values())] if seen is None else [through])
+        found = _first_offsets(
+            measure, [through, *(f.camera.view for f in now.values())] if seen is None else [through]
+        )
         if found is None:
             break
         seen = found
-        now = _with_tissue({m: now[m, s].camera.view for m, s in now if not s}, sight, seen)
+        now = _fit_all({m: now[m, s].camera.view for m, s in now if not s}, observed, seen)
         best = _cheapest(now)
-        if not len(places) or _apart_mm(now[best].camera, through, places) < SETTLED_MM:
+        if not len(places) or _apart_mm(now[best].camera, through, places) < CONVERGED_MM:
             break
     model, moved = best
     taken = now[best]
-    if taken.sight.tissue is not None:
-        taken = fit(taken.camera.view, model, taken.sight.with_looser_tissue(SHARED_BY_TILES), motion=moved)
-    return Choice(model, taken, alone[model], moved, seen, _open_mm(now, best, places))
+    if taken.observed.tiles is not None:
+        taken = fit(taken.camera.view, model, taken.observed.with_inflated_tile_sigma(SHARED_TILE_ERROR), motion=moved)
+    return SelectedCamera(model, taken, by_corners[model], moved, seen, _ambiguity_mm(now, best, places))
 
 
-def _starts(sight: Sight, rows: int, cols: int, square: CubeCamera | None) -> dict[Model, View]:
-    flat = Flat.of(sight.corners, sight.pixels)
+def _starts(observed: CubeObservations, rows: int, cols: int, square: CubeCamera | None) -> dict[Model, View]:
+    flat = PlaneAffinity.of(observed.corners, observed.pixels)
     low, high = ASPECT_RANGE
     if not low < flat.aspect < high:
         raise RegistrationError(
@@ -123,9 +140,9 @@ def _starts(sight: Sight, rows: int, cols: int, square: CubeCamera | None) -> di
             aspect=round(flat.aspect, 3),
         )
     starts: dict[Model, View] = {} if square is None else {FRAME: square.view}
-    pixels = in_square_pixels(sight.pixels, flat.aspect, rows)
+    pixels = in_square_pixels(observed.pixels, flat.aspect, rows)
     try:
-        even = solve_camera(sight.corners, pixels, sight.sigma_px, rows, cols).view
+        even = solve_camera(observed.corners, pixels, observed.sigma_px, rows, cols).view
         starts[ASPECT] = replace(even, intrinsics=replace(even.intrinsics, aspect=flat.aspect))
     except RegistrationError:
         pass
@@ -135,20 +152,22 @@ def _starts(sight: Sight, rows: int, cols: int, square: CubeCamera | None) -> di
     return starts
 
 
-def _first_sighting(look: Look, views: Sequence[View]) -> Sighting | None:
-    """What is found through the first of ``views`` that finds enough."""
+def _first_offsets(measure: MeasureOffsets, views: Sequence[View]) -> TileOffsets | None:
+    """The offsets measured through the first of ``views`` that has enough of them."""
     for view in views:
-        found = look(view)
+        found = measure(view)
         if found is not None and (np.isfinite(found.offsets[:, 0]) & (found.weight > 0)).sum() >= LEAST_TILES:
             return found
     return None
 
 
-def _with_tissue(views: dict[Model, View], sight: Sight, seen: Sighting) -> dict[tuple[Model, bool], Fit]:
-    """Every kind, with a specimen that stayed and with one that moved, fitted to corners and specimen."""
+def _fit_all(
+    views: dict[Model, View], observed: CubeObservations, seen: TileOffsets
+) -> dict[tuple[Model, bool], CameraFit]:
+    """Fit every model to corners and tiles, with a specimen that stayed and with one that moved."""
     sigma_mm, fits = TILE_MM, {}
     for _ in range(2):
-        whole = replace(sight, tissue=Tissue.of(seen, sigma_mm))
+        whole = replace(observed, tiles=TileObservations.of(seen, sigma_mm))
         fits = {
             (model, moved): fit(view, model, whole, motion=moved)
             for model, view in views.items()
@@ -159,21 +178,21 @@ def _with_tissue(views: dict[Model, View], sight: Sight, seen: Sighting) -> dict
     return fits
 
 
-def _priced(choice: tuple[Model, bool], fitted: Fit) -> float:
-    return fitted.cost + choice[0].priced + MOTION_PRICED * choice[1]
+def _penalised(choice: tuple[Model, bool], fitted: CameraFit) -> float:
+    return fitted.cost + choice[0].penalty + MOTION_PENALTY * choice[1]
 
 
-def _cheapest(fits: dict[tuple[Model, bool], Fit]) -> tuple[Model, bool]:
-    return min(fits, key=lambda k: _priced(k, fits[k]))
+def _cheapest(fits: dict[tuple[Model, bool], CameraFit]) -> tuple[Model, bool]:
+    return min(fits, key=lambda k: _penalised(k, fits[k]))
 
 
-def _open_mm(fits: dict[tuple[Model, bool], Fit], best: tuple[Model, bool], places: Floats) -> float:
-    """What the kinds that are not ruled out leave open of the specimen's place."""
+def _ambiguity_mm(fits: dict[tuple[Model, bool], CameraFit], best: tuple[Model, bool], places: Floats) -> float:
+    """Lateral distance between where the models that are not ruled out put the specimen, root mean square."""
     if not len(places):
         return 0.0
     variance = 0.0
     # A frame camera of square pixels is what cubes without a sign of anything else were recorded with.
-    least = -OPEN if best[0] is not FRAME else DOUBTED if len(fits[best].tile_miss) else np.inf
+    least = -NOT_RULED_OUT if best[0] is not FRAME else IN_DOUBT if len(fits[best].tile_miss) else np.inf
     for key, other in fits.items():
         ahead = fits[best].cost - other.cost
         if key[0] is best[0] or key[1] != best[1] or ahead < least:

@@ -107,7 +107,7 @@ def place_by_homography(
         xyz, normal, rgb = found[keep, :3], found[keep, 3:6], found[keep, 6:]
         normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
         colours = np.clip(rgb + 0.5, 0, 255).astype(np.uint8)
-        return _placed(np.stack([rows[keep], cols[keep]], -1), xyz, normal, colours, view, caster, None)
+        return _placement(np.stack([rows[keep], cols[keep]], -1), xyz, normal, colours, view, caster, None)
 
     return _in_strips(view, mirrored, place)
 
@@ -123,7 +123,7 @@ def place_by_camera(view: View, caster: RayCaster, mirrored: bool) -> Placement:
         hits = caster.cast(view.origins(seen), view.world_rays(seen))
         keep = hits.hit
         normals, rgb = caster.normals(hits)[keep], caster.colours(hits)[keep]
-        return _placed(
+        return _placement(
             np.stack([rows[keep], cols[keep]], -1),
             hits.xyz[keep],
             normals,
@@ -160,7 +160,7 @@ def _in_strips(
     return Placement(**joined)
 
 
-def _placed(
+def _placement(
     pixels: NDArray[np.integer],
     xyz: NDArray[np.float32],
     normal: NDArray[np.float32],
@@ -174,7 +174,7 @@ def _placed(
     cosine = np.clip((away * normal).sum(1), -1, 1)
     occluded, undercut = np.zeros(len(xyz), bool), np.zeros(len(xyz), bool)
     if where is None:
-        occluded = _hidden_from(view, xyz, caster)
+        occluded = _occluded_from(view, xyz, caster)
         where = np.full(len(xyz), -1, np.int32), np.zeros((len(xyz), 2), np.float32)
     else:
         up = np.broadcast_to([0.0, 0.0, 1.0], xyz.shape)
@@ -191,7 +191,7 @@ def _placed(
     )
 
 
-def _hidden_from(view: View, xyz: NDArray[np.float32], caster: RayCaster) -> NDArray[np.bool_]:
+def _occluded_from(view: View, xyz: NDArray[np.float32], caster: RayCaster) -> NDArray[np.bool_]:
     """Whether tissue stands between the camera and places (S, 3) that were looked up from above.
 
     Judged at the surface's own highest point over each place: the grid's cells smear their places across steps, and

@@ -1,4 +1,4 @@
-"""From placements on the surface to the cloud's points: which lie on the specimen, on a card, are doubtful."""
+"""Make the cloud's points of placements on the surface, with flags and standard deviations."""
 
 from __future__ import annotations
 

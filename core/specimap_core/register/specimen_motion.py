@@ -1,6 +1,6 @@
-"""Whether the specimen lies in the cube where the photos saw it, judged by its texture and outline.
+"""Detect a motion of the specimen between photos and cube, by its texture and outline.
 
-The tiles of a :class:`~specimap_core.register.tile_offsets.Sighting` give a rigid motion in the image's plane, and
+The tiles of a :class:`~specimap_core.register.tile_offsets.TileOffsets` give a rigid motion in the image's plane, and
 their scatter its uncertainty.
 """
 
@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 from specimap_core.geometry.cameras import Floats, View
 from specimap_core.geometry.robust import SIGMA_OF_MAD
 from specimap_core.register.tile_matching import LEAST_TILES
-from specimap_core.register.tile_offsets import Sighting, sight_specimen
+from specimap_core.register.tile_offsets import TileOffsets, measure_tile_offsets
 from specimap_core.surface.raycast import RayCaster
 
 LEAST_AGREE = 0.6
 LEAST_MARKERS = 4
 """Three nearly coplanar markers leave the cube's focal length open: raised tissue then seems to have moved."""
 SHARED_MM = 0.02
-"""What all tiles are off together, one sd: seen through the true camera, specimens that did not move show 0.00 to 0.01
-mm on own phantoms and 0.02 to 0.03 mm on path-traced ones."""
+"""Standard deviation of the error that all tiles share: seen through the true camera, specimens that did not move show
+0.00 to 0.01 mm on own phantoms and 0.02 to 0.03 mm on path-traced ones."""
 ALLOWED_MM = 0.3
 ALLOWED_SIGMA = 4.0
 
@@ -53,7 +53,7 @@ class Shift:
         return f"The specimen seems to have moved by about {self.moved_mm:.1f} mm between photos and cube."
 
 
-def specimen_shift(
+def measure_motion(
     image: NDArray[np.float32],
     view: View,
     caster: RayCaster,
@@ -62,23 +62,23 @@ def specimen_shift(
     markers_in_cube: int,
     mirrored: bool = False,
 ) -> Shift | None:
-    """Motion of the specimen, or None where it cannot be told: as :func:`sight_specimen` says, or with too few markers
-    in the cube to tell a motion from a wrong camera."""
+    """Motion of the specimen; None where :func:`measure_tile_offsets` measures nothing, or where the cube shows too few
+    markers to distinguish a motion from a wrong camera."""
     if markers_in_cube < LEAST_MARKERS:
         return None
-    sighting = sight_specimen(image, view, caster, corners, mirrored=mirrored)
-    return None if sighting is None else shift_of(sighting)
+    measured = measure_tile_offsets(image, view, caster, corners, mirrored=mirrored)
+    return None if measured is None else motion_of_tiles(measured)
 
 
-def shift_of(sighting: Sighting) -> Shift | None:
-    """The rigid motion that a sighting shows; None where its tiles contradict."""
-    motion = _rigid(sighting.centres, sighting.offsets, sighting.weight, sighting.px)
+def motion_of_tiles(measured: TileOffsets) -> Shift | None:
+    """The rigid motion that the tiles show; None where they contradict each other."""
+    motion = _rigid(measured.centres, measured.offsets, measured.weight, measured.px)
     if motion is None:
         return None
     (dx, dy), turn, moved, sigma, count = motion
-    across_mm, down_mm = sighting.view.mm_per_px(sighting.depth_mm) / sighting.scale
+    across_mm, down_mm = measured.view.mm_per_px(measured.depth_mm) / measured.scale
     # Image to marker frame: the camera looks down, so that its axes' horizontal parts carry the shift.
-    across = sighting.view.cam_from_world.R.T @ np.array([dx * across_mm, dy * down_mm, 0.0])
+    across = measured.view.cam_from_world.R.T @ np.array([dx * across_mm, dy * down_mm, 0.0])
     shift = float(across[0]), float(across[1])
     mm = float(np.sqrt(across_mm * down_mm))
     return Shift(shift, -float(np.degrees(turn)), float(moved * mm), float(sigma * mm), count)

@@ -1,4 +1,4 @@
-"""Parts of an image searched for in another that shows them by other channels."""
+"""Match tiles of an image in another that shows them by other channels."""
 
 from __future__ import annotations
 

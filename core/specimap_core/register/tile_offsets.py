@@ -1,4 +1,4 @@
-"""Where the specimen shows in the cube, tile by tile, beside where a solved camera expects it.
+"""Measure how far tiles of the specimen show in the cube from where a solved camera expects them.
 
 The photos' colours on the mesh are seen through that camera and compared with the cube's own image. A tile is moved
 over the image; at each place the image is explained by a linear mixture of the tile's channels (logarithms of its
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specimap_core.geometry.cameras import Floats, View
-from specimap_core.register.stripes import without_stripes
+from specimap_core.register.destriping import destriped
 from specimap_core.register.tile_matching import Tiles
 from specimap_core.surface.raycast import RayCaster
 from specimap_core.surface.regions import on_card, on_specimen, raised_mm
@@ -41,8 +41,8 @@ SAMPLES = 24
 
 
 @dataclass(frozen=True)
-class Sighting:
-    """Tiles found in an image through ``view``.
+class TileOffsets:
+    """Offsets of tiles in an image, measured through ``view``.
 
     ``centres`` (T, 2) and ``offsets`` (T, 2) x, y in working pixels of ``px`` mm on the marker plane: each tile's place
     about their common middle, and how far from there it shows (NaN where it does not); ``weight`` (T,), zero where it
@@ -60,10 +60,10 @@ class Sighting:
     depth_mm: float
 
 
-def sight_specimen(
+def measure_tile_offsets(
     image: NDArray[np.float32], view: View, caster: RayCaster, corners: Floats, *, mirrored: bool = False
-) -> Sighting | None:
-    """Look for the specimen; None where there is none, it has no texture, or the tiles' places contradict.
+) -> TileOffsets | None:
+    """Measure the tiles' offsets; None where there is none, it has no texture, or the tiles' places contradict.
 
     ``image`` (rows, cols): a linear image of the cube in its own columns, such as its band mean, NaN where unknown;
     ``view``: the cube's solved camera; ``corners`` (Q, 4, 3) mm of the markers; ``mirrored``: the cube's columns run
@@ -93,7 +93,7 @@ def sight_specimen(
         return None
     offsets, weight = found
     points = np.stack([_sampled(xyz, tiles, t) for t in range(len(tiles.centres))])
-    return Sighting(view, tiles.centres, offsets, weight, points, px, scale, depth)
+    return TileOffsets(view, tiles.centres, offsets, weight, points, px, scale, depth)
 
 
 def _sampled(xyz: NDArray[np.float32], tiles: Tiles, tile: int) -> Floats:
@@ -148,7 +148,7 @@ def _rendered(
 
 def _log_image(seen: NDArray[np.float32], across: float, down: float) -> NDArray[np.float32]:
     """Logarithm of the image at ``across`` of its width and ``down`` of its height, without dead pixels and lines."""
-    seen = without_stripes(seen)
+    seen = destriped(seen)
     finite = np.isfinite(seen)
     middle = np.float32(np.median(seen[finite])) if finite.any() else np.float32(0)
     calm = cv2.medianBlur(np.ascontiguousarray(np.where(finite, seen, middle), np.float32), 3)

@@ -1,4 +1,4 @@
-"""What a document is made of, whether it becomes HTML or PDF. All text is plain: no markup, nothing escaped."""
+"""Building blocks of a document, for HTML and PDF alike. All text is plain: no markup, nothing escaped."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Paragraph:
 
 @dataclass(frozen=True)
 class Bullets:
-    """A list; an item is a term, which may be empty, and what is said of it."""
+    """A list; an item is a term, which may be empty, and its description."""
 
     items: tuple[tuple[str, str], ...]
 
@@ -56,7 +56,7 @@ class Picture:
     """A figure, drawn when it is its turn, so that one is in memory at a time.
 
     ``kind``: a ``chart`` is kept as lines where the format can, a ``map`` as pixels, a ``photo`` with losses. ``alt``
-    tells who cannot see it what it shows; ``caption`` tells everyone how to read it.
+    describes it to readers who cannot see it; ``caption`` tells everyone how to read it.
     """
 
     draw: Callable[[], Figure]

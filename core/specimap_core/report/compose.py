@@ -19,10 +19,10 @@ from specimap_core.report.inputs import Material
 from specimap_core.report.model import LeaveOneOut, MethodFigures, Report
 from specimap_core.report.wording import (
     MEANINGS,
-    REFUSALS,
-    REMARKS,
-    UNKNOWN_REFUSAL,
-    UNKNOWN_REMARK,
+    REFUSAL_ADVICE,
+    UNKNOWN_REFUSAL_ADVICE,
+    UNKNOWN_WARNING_ADVICE,
+    WARNING_ADVICE,
     checks,
     mm,
     verdict,
@@ -70,19 +70,19 @@ def compose(material: Material) -> Document:
 
 
 def _verdict(report: Report, errors: Judged | None) -> Iterator[Block]:
-    said = verdict(report)
+    judged = verdict(report)
     if errors is not None:
         found = errors.errors
         truth = f"Against truth the median error is {mm(found.median)} mm, and 95 % are below {mm(found.p95)} mm."
-        said = replace(said, sentences=(*said.sentences, truth))
-    yield Callout(said.level, said.title, " ".join(said.sentences), " ".join(said.actions))
+        judged = replace(judged, sentences=(*judged.sentences, truth))
+    yield Callout(judged.level, judged.title, " ".join(judged.sentences), " ".join(judged.actions))
     rows = tuple((c.name, c.found, c.wanted, "good" if c.good else c.action) for c in checks(report))
     marks: tuple[Level, ...] = tuple("good" if c.good else "attention" for c in checks(report))
     head = ("Check", "Found", "Wanted", "Result, what to do")
     yield Table("Checks", head, rows, (0.23, 0.23, 0.2, 0.34), marks=marks)
-    for remark in report.warnings:
-        todo = REMARKS.get(remark.code, UNKNOWN_REMARK)
-        yield Callout("note", f"Warning: {remark.code.replace('_', ' ')}", remark.message, todo)
+    for warning in report.warnings:
+        todo = WARNING_ADVICE.get(warning.code, UNKNOWN_WARNING_ADVICE)
+        yield Callout("note", f"Warning: {warning.code.replace('_', ' ')}", warning.message, todo)
     if not report.warnings:
         yield Paragraph("The run gave no warnings.")
 
@@ -99,7 +99,7 @@ def _figures(report: Report) -> Iterator[Block]:
     rows = (
         ("2D corner error, mean ± sd", *map(_corner_2d, methods), published.CORNER_2D_WORDS),
         ("3D corner error, median (quartiles)", *map(_corner_3d, methods), published.CORNER_3D_WORDS),
-        ("Leaving a marker out, median (largest)", *(_left(m.leave_one_marker_out_mm) for m in methods), "–"),
+        ("Leaving a marker out, median (largest)", *(_leave_one_out(m.leave_one_marker_out_mm) for m in methods), "–"),
         (f"Marker edge, mean ± sd (known: {edge.expected:g})", f"{mm(edge.mean)} ± {mm(edge.std)}", *rest[1:]),
         ("Between the two methods, median (largest)", f"{mm(parallax.median)} ({mm(parallax.maximum)})", *rest[1:]),
         ("Stated sigma of the specimen, median (95 %)", f"{mm(sigma.median)} ({mm(sigma.p95)})", *rest[1:]),
@@ -125,7 +125,7 @@ def _corner_3d(figures: MethodFigures) -> str:
     return f"{mm(found.median)} ({mm(found.q1)}, {mm(found.q3)})"
 
 
-def _left(figures: LeaveOneOut | None) -> str:
+def _leave_one_out(figures: LeaveOneOut | None) -> str:
     return "–" if figures is None else f"{mm(figures.median)} ({mm(figures.maximum)})"
 
 
@@ -134,7 +134,9 @@ def _refused(report: Report) -> Iterator[Block]:
         yield Table(
             "Photos that were not used",
             ("Photo", "Reason", "What to do"),
-            tuple((r.name, r.reason, REFUSALS.get(r.code, UNKNOWN_REFUSAL)) for r in report.photos.refused),
+            tuple(
+                (r.name, r.reason, REFUSAL_ADVICE.get(r.code, UNKNOWN_REFUSAL_ADVICE)) for r in report.photos.refused
+            ),
             (0.25, 0.4, 0.35),
         )
 
@@ -183,9 +185,9 @@ def _run(report: Report) -> Iterator[Block]:
     if report.inputs:
         hashes = tuple((name, value) for name, value in report.inputs.items())
         yield Table("Hashes of the inputs (SHA-256) and key of the result", ("Input", "Hash"), hashes, (0.2, 0.8))
-    for remark in report.warnings:
-        if remark.code.startswith("licence"):
-            yield Callout("attention", "Licence", remark.message, REMARKS.get(remark.code, ""))
+    for warning in report.warnings:
+        if warning.code.startswith("licence"):
+            yield Callout("attention", "Licence", warning.message, WARNING_ADVICE.get(warning.code, ""))
 
 
 def flattened(settings: dict[str, object], prefix: str = "") -> Iterator[tuple[str, object]]:

@@ -69,7 +69,7 @@ TEMPLATE = """
 {%- if b.text %}<p>{{ b.text }}</p>{% endif %}
 {%- if b.action %}<p><strong>What to do:</strong> {{ b.action }}</p>{% endif %}</div>
 {%- elif kind == "Bullets" %}
-<dl>{% for term, said in b.items %}<dt>{{ term }}</dt><dd>{{ said }}</dd>{% endfor %}</dl>
+<dl>{% for term, text in b.items %}<dt>{{ term }}</dt><dd>{{ text }}</dd>{% endfor %}</dl>
 {%- elif kind == "Table" %}
 <div class="scroll"><table><caption>{{ b.caption }}</caption>
 <thead><tr>{% for cell in b.head %}<th scope="col"{{ numeric(b, loop.index0) }}>{{ cell }}</th>{% endfor %}</tr></thead>

@@ -1,4 +1,4 @@
-"""What a document is drawn from: the files of a finished run, and truth where there is some."""
+"""Inputs of a document: the files of a finished run, and truth where there is some."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from specimap_core.cloud import Cloud
 from specimap_core.errors import PhotoUnreadableError
 from specimap_core.photos.contact_sheet import read_tiles
-from specimap_core.report.maps import Above, CubeFrame, cube_frame, from_above
+from specimap_core.report.maps import CubeFrame, TopRaster, cube_frame, top_raster
 from specimap_core.report.model import Report, read_report
 
 if TYPE_CHECKING:
@@ -39,9 +39,9 @@ class Material:
         return cube_frame(self.cloud, self.shape)
 
     @cached_property
-    def above(self) -> Above:
+    def above(self) -> TopRaster:
         """The topmost surface."""
-        return from_above(self.cloud)
+        return top_raster(self.cloud)
 
 
 def read_material(folder: Path, truth: Path | None = None) -> Material:

@@ -61,7 +61,7 @@ def cube_frame(cloud: Cloud, shape: tuple[int, int]) -> CubeFrame:
 
 
 def spacing_mm(cloud: Cloud) -> float:
-    """Distance in the marker plane of what neighbouring pixels of the cube show, mm; NaN where it cannot be told."""
+    """Distance in the marker plane of what neighbouring pixels of the cube show, mm; NaN with too few points."""
     low = np.flatnonzero((cloud.flags & Flag.SPECIMEN) == 0)
     points = low if len(low) >= 3 else np.arange(cloud.n_points)
     points = points[:: max(1, len(points) // _FITTED_POINTS)]
@@ -76,7 +76,7 @@ def spacing_mm(cloud: Cloud) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Above:
+class TopRaster:
     """The topmost surface on a grid, y up: ``height_mm`` (rows, cols), ``rgb`` (rows, cols, 3); and where it lies:
     ``extent_mm`` left, right, bottom, top."""
 
@@ -86,7 +86,7 @@ class Above:
     grid_mm: float
 
 
-def from_above(cloud: Cloud) -> Above:
+def top_raster(cloud: Cloud) -> TopRaster:
     """The cloud from straight above, in the marker frame; NaN and white where there is nothing."""
     x_min, y_min, x_max, y_max = extent_mm(cloud)
     spacing = spacing_mm(cloud)
@@ -105,4 +105,4 @@ def from_above(cloud: Cloud) -> Above:
     half = grid / 2
     bounds = (x_min - half, x_min + (view.cols - 0.5) * grid, y_min - half, y_min + (view.rows - 0.5) * grid)
     shape = view.rows, view.cols
-    return Above(height.reshape(shape), rgb.reshape(*shape, 3), bounds, grid)
+    return TopRaster(height.reshape(shape), rgb.reshape(*shape, 3), bounds, grid)

@@ -9,6 +9,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from specimap_core.errors import NotFoundError
 from specimap_core.json_text import json_ready, json_text
+from specimap_core.notices import Notice
 
 # JSON has no NaN: a figure that could not be had is null there.
 Figure = Annotated[float, BeforeValidator(lambda value: float("nan") if value is None else value)]
@@ -124,13 +125,6 @@ class SigmaFigures(Section):
     p95: Figure
 
 
-class Remark(Section):
-    """Something that a reader of the result should know."""
-
-    code: str
-    message: str
-
-
 class Coverage(Section):
     """Share of the cube's pixels between the markers that have a point; counts of points."""
 
@@ -193,7 +187,7 @@ class Report(Section):
     photo_focal_px: Figure
     seconds: dict[str, Figure]
     reused_stages: list[str]
-    warnings: list[Remark]
+    warnings: list[Notice]
     settings: dict[str, object] = Field(default_factory=dict)
     inputs: dict[str, str] = Field(default_factory=dict)
     photo_corners: list[PhotoCorners] | None = None

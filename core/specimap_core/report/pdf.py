@@ -147,8 +147,8 @@ def _flowables(block: Bullets | Callout | Table, width: float) -> Iterator[Any]:
         yield Spacer(1, 7)
     elif isinstance(block, Bullets):
         rows = [
-            [_text(term, _style(8.5, colour="#5a5a5a", after=0)), _text(said, _style(8.5, after=0))]
-            for term, said in block.items
+            [_text(term, _style(8.5, colour="#5a5a5a", after=0)), _text(text, _style(8.5, after=0))]
+            for term, text in block.items
         ]
         yield _grid(rows, [0.3 * width, 0.7 * width], [])
         yield Spacer(1, 6)

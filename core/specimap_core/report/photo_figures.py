@@ -84,8 +84,8 @@ def draw_photos(photos: Sequence[PhotoCorners], tiles: Sequence[Bytes], first: i
         arrows.append(residuals.reshape(-1, 2) * scale * factor)
         # Numbers, not names: whatever a photo is called, its name stands in the table only.
         ax.text(x, y - 6, f"{first + k}", fontsize=p.FONT_PT, color=p.INK, ha="left", va="bottom", fontweight="bold")
-        said = f"{len(photo.marker_ids)} markers, {_rms(photo):.2f} px" if photo.marker_ids else "no marker"
-        ax.text(x + tile_w, y - 6, said, fontsize=p.SMALL_PT, color=p.MUTED, ha="right", va="bottom")
+        label = f"{len(photo.marker_ids)} markers, {_rms(photo):.2f} px" if photo.marker_ids else "no marker"
+        ax.text(x + tile_w, y - 6, label, fontsize=p.SMALL_PT, color=p.MUTED, ha="right", va="bottom")
     ax.imshow(canvas, interpolation="antialiased")
     ax.add_collection(PolyCollection(outlines, facecolor="none", edgecolor="white", linewidth=2.0))
     ax.add_collection(PolyCollection(outlines, facecolor="none", edgecolor=p.BLUE, linewidth=1.1))

@@ -33,7 +33,7 @@ PRINT_DPI = 170
 INK = "#1b1b1b"
 MUTED = "#5a5a5a"
 RULE = "#d0d0d0"
-# Okabe and Ito (2008): told apart with any common colour vision, and in grey print by their order.
+# Okabe and Ito (2008): distinguishable with any common colour vision, and in grey print by their order.
 BLUE, ORANGE, GREEN, VERMILION = "#0072b2", "#e69f00", "#009e73", "#d55e00"
 SKY, PURPLE, YELLOW, BLACK = "#56b4e9", "#cc79a7", "#f0e442", "#000000"
 PALETTE = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, BLACK, YELLOW)

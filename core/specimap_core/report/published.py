@@ -1,4 +1,4 @@
-"""What Bicchi et al. (2026) state of their method: one A100, two specimens."""
+"""Figures that Bicchi et al. (2026) state of their method: one A100, two specimens."""
 
 from __future__ import annotations
 

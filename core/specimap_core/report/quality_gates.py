@@ -1,4 +1,4 @@
-"""What a finished run's figures must hold before anyone relies on them: warnings, and a refusal where nothing is left.
+"""Quality gates on a finished run's figures: warnings, and a refusal where nothing usable is left.
 
 Limits were set between sets that are in order and broken ones. In order: the phantoms (corners 0.05 to 0.21 px RMS, the
 worst photo 0.53 px and 4 times the median, coverage above 99 %) and 42 real photos (0.49 px at 1280 px). Broken: a card
@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from specimap_core.errors import RegistrationError, ResultInsufficientError
-from specimap_core.report.model import PhotoCorners, Remark, Report
+from specimap_core.notices import Notice
+from specimap_core.report.model import PhotoCorners, Report
 
 LEAST_COVERAGE = 0.97
 """Of the cube's pixels between the markers."""
@@ -75,27 +76,27 @@ def gated(report: Report, edge_mm: float) -> Report:
         RegistrationError: the markers in the cube are not those in the photos.
         ResultInsufficientError: hardly anything has a point.
     """
-    warnings = [Remark(code=c, message=m) for c, m in _remarks(report)]
+    warnings = _warnings(report)
     _check_cube(report, edge_mm)
     _check_useful(report, warnings)
     return report.model_copy(update={"warnings": [*report.warnings, *warnings]})
 
 
-def _remarks(report: Report) -> list[tuple[str, str]]:
-    remarks: list[tuple[str, str]] = []
+def _warnings(report: Report) -> list[Notice]:
+    warnings: list[Notice] = []
     coverage, rms, outlying = report.coverage, report.reprojection_px.after, outlying_photos(report)
     if not coverage.between_markers > LEAST_COVERAGE:
-        remarks.append(
-            (
+        warnings.append(
+            Notice(
                 "coverage_low",
                 f"Only {100 * coverage.between_markers:.1f} % of the cube's pixels between the markers have a point.",
             )
         )
     if not coverage.specimen_points:
-        remarks.append(("specimen_not_found", "Nothing rises above the markers' plane as a specimen does."))
+        warnings.append(Notice("specimen_not_found", "Nothing rises above the markers' plane as a specimen does."))
     if not rms <= corner_limit_px(report):
-        remarks.append(
-            (
+        warnings.append(
+            Notice(
                 "corners_scatter",
                 f"The markers' corners in the photos lie {rms:.2f} px (RMS) from where all photos together put them; "
                 f"{corner_limit_px(report):.1f} px are the most to be expected.",
@@ -106,16 +107,16 @@ def _remarks(report: Report) -> list[tuple[str, str]]:
             f"{o.name} {o.px:.1f} px, marker {o.marker} {o.marker_px:.1f} px" for o in outlying[:MOST_NAMED]
         )
         more = f"; and {len(outlying) - MOST_NAMED} more" if len(outlying) > MOST_NAMED else ""
-        remarks.append(("photo_outlying", f"In some photos the markers' corners lie off: {named}{more}."))
+        warnings.append(Notice("photo_outlying", f"In some photos the markers' corners lie off: {named}{more}."))
     cube = report.cube_camera.reprojection_rms_px
     if not cube <= MOST_CUBE_RMS_PX:
-        remarks.append(
-            (
+        warnings.append(
+            Notice(
                 "cube_corners_scatter",
                 f"The markers' corners in the cube lie {cube:.2f} px (RMS) from where its solved camera puts them.",
             )
         )
-    return remarks
+    return warnings
 
 
 def _check_cube(report: Report, edge_mm: float) -> None:
@@ -129,7 +130,7 @@ def _check_cube(report: Report, edge_mm: float) -> None:
         )
 
 
-def _check_useful(report: Report, warnings: list[Remark]) -> None:
+def _check_useful(report: Report, warnings: list[Notice]) -> None:
     covered, specimen = report.coverage.between_markers, report.coverage.specimen_points
     if covered >= USELESS_COVERAGE and (specimen or covered >= USELESS_WITHOUT_SPECIMEN):
         return

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from specimap_core.cloud import Cloud, Flag
 from specimap_core.report import plotting as p
 from specimap_core.report.inputs import Bytes
-from specimap_core.report.maps import Above, CubeFrame
+from specimap_core.report.maps import CubeFrame, TopRaster
 from specimap_core.report.model import CubeCorners
 from specimap_core.report.photo_figures import corners_of
 
@@ -35,7 +35,7 @@ NORMAL_WITHIN = ((1.0, 0.683), (2.0, 0.954), (3.0, 0.997))
 
 
 def on_specimen(cloud: Cloud) -> NDArray[np.bool_]:
-    """Points (S,) of the specimen; all of them where none is said to be."""
+    """Points (S,) of the specimen; all of them where none is flagged so."""
     found = (cloud.flags & Flag.SPECIMEN) > 0
     return found if found.any() else np.ones(cloud.n_points, bool)
 
@@ -77,8 +77,8 @@ def draw_flags(cloud: Cloud, frame: CubeFrame) -> Figure:
     return figure
 
 
-def draw_above(above: Above, preview: Bytes | None) -> Figure:
-    """The photos' colours on the surface, and beside them the first three principal components of the spectra."""
+def draw_above(above: TopRaster, preview: Bytes | None) -> Figure:
+    """The photos' colours on the surface, and next to them the first three principal components of the spectra."""
     wide = p.WIDTH_IN / (2 if preview is not None else 1.6)
     figure = p.figure(p.WIDTH_IN if preview is not None else wide, wide * _ratio(above) + 0.35)
     panels = figure.subplots(1, 2 if preview is not None else 1, squeeze=False)[0]
@@ -91,7 +91,7 @@ def draw_above(above: Above, preview: Bytes | None) -> Figure:
     return figure
 
 
-def draw_height(above: Above) -> Figure:
+def draw_height(above: TopRaster) -> Figure:
     """The height over the marker plane, with millimetres on all axes."""
     figure = p.figure(p.WIDTH_IN * 0.85, min(MOST_HIGH_IN, p.WIDTH_IN * 0.68 * _ratio(above) + 0.5))
     ax = p.styled(figure.add_subplot(), title="Height over the marker plane", x="x, mm", y="y, mm", grid=False)
@@ -187,7 +187,7 @@ def draw_reliability(errors: Judged) -> Figure:
     return figure
 
 
-def _ratio(above: Above) -> float:
+def _ratio(above: TopRaster) -> float:
     return float(above.height_mm.shape[0] / above.height_mm.shape[1])
 
 

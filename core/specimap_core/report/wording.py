@@ -1,4 +1,4 @@
-"""What the figures mean in words: the verdict, the checks, and what to do about each warning and refused photo."""
+"""Words for the figures: the verdict, the checks, and advice on each warning and refused photo."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MOST_REFUSED = 2
 LAYOUT_MARKERS = 8
 """Up to so many markers, all should show in the cube; of a whole board, four suffice."""
 
-REMARKS = {
+WARNING_ADVICE = {
     "few_photos": f"Take {RECOMMENDED_PHOTOS} or more photos from all around; the errors then become smaller.",
     "scale_implausible": "Measure the print with a calliper and give the edge of the black square in millimetres.",
     "scale_contradicts_exif": "Measure the black edge of a printed marker and compare it with the edge that was given.",
@@ -39,6 +39,8 @@ REMARKS = {
     "quantity_not_reflectance": "Give a white frame of the same kind, or a cube of reflectance, where that is needed.",
     "reference_units_differ": "Give cube, white and dark frame alike: all as counts of the same export.",
     "reference_exposure_differs": "Record cube and references with one exposure, or bring their counts to one first.",
+    "white_wavelengths_differ": "Give the white frame that was recorded with this cube and the same bands.",
+    "dark_wavelengths_differ": "Give the dark frame that was recorded with this cube and the same bands.",
     "white_saturated": "Record the white frame again with a shorter exposure: reflectance is too high where it clips.",
     "saturated": "Expose the cube shorter: saturated pixels are flagged and carry no true spectrum.",
     "wavelengths_missing": "Export the cube with its wavelengths; bands are known by number only.",
@@ -79,9 +81,9 @@ REMARKS = {
     "licence_apache": "Nothing: the licence allows any use.",
     "licence_non_commercial": "Use this result for no commercial purpose; run the default backend for any other.",
 }
-UNKNOWN_REMARK = "Read it before using the result; the documentation of errors and warnings says more."
+UNKNOWN_WARNING_ADVICE = "Read it before using the result; the documentation of errors and warnings says more."
 
-REFUSALS = {
+REFUSAL_ADVICE = {
     "photo_unreadable": "Copy the photo again, or take it again.",
     "photo_raw": "Export it as JPEG, with the same settings as the others.",
     "photo_duplicate": "Nothing: the same photo is used once.",
@@ -100,7 +102,7 @@ GRAVE = (
     "cube_corners_scatter",
 )
 """Warnings that put all places in doubt."""
-UNKNOWN_REFUSAL = "Take it again from the same side with the markers in view."
+UNKNOWN_REFUSAL_ADVICE = "Take it again from the same side with the markers in view."
 
 MEANINGS = (
     (
@@ -223,7 +225,7 @@ def verdict(report: Report) -> Verdict:
     """Whether the result holds what can be expected of it, and what to do where it does not."""
     failed = [check for check in checks(report) if not check.good]
     grave = [w for w in report.warnings if w.code in GRAVE]
-    said = [placed(report), used(report), *(w.message for w in grave)]
+    sentences = [placement_sentence(report), photos_sentence(report), *(w.message for w in grave)]
     level: Level = "attention"
     if grave:
         title = "Look before use: all places are in doubt."
@@ -233,11 +235,11 @@ def verdict(report: Report) -> Verdict:
         title, level = "The result holds what can be expected, with the warnings below.", "note"
     else:
         title, level = "The result holds what can be expected.", "good"
-    actions = [*(REMARKS[w.code] for w in grave), *(check.action for check in failed)]
-    return Verdict(level, title, tuple(said), tuple(actions))
+    actions = [*(WARNING_ADVICE[w.code] for w in grave), *(check.action for check in failed)]
+    return Verdict(level, title, tuple(sentences), tuple(actions))
 
 
-def placed(report: Report) -> str:
+def placement_sentence(report: Report) -> str:
     """How sure the places are."""
     middle, most = report.sigma_mm.median, report.sigma_mm.p95
     if not (math.isfinite(middle) and math.isfinite(most)):
@@ -248,7 +250,7 @@ def placed(report: Report) -> str:
     )
 
 
-def used(report: Report) -> str:
+def photos_sentence(report: Report) -> str:
     """How many photos were used, and why not all."""
     given, count = report.photos.given, len(report.photos.used)
     if not given - count:

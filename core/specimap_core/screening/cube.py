@@ -13,9 +13,10 @@ from specimap_core.cube import FORMATS, Cube, inspect, open_cube
 from specimap_core.cube.envi_header import EnviHeader, is_envi_header, read_header
 from specimap_core.cube.npy import starts_with
 from specimap_core.cube.pixels import sampled_rows
-from specimap_core.cube.wavelengths import Warnings, bad_band_mask, nanometres
+from specimap_core.cube.wavelengths import bad_band_mask, nanometres
 from specimap_core.errors import CubeFormatError, CubeHeaderError, SpecimapError, StorageFullError
 from specimap_core.geometry.cameras import Floats
+from specimap_core.notices import Notices
 from specimap_core.screening.verdict import Verdict
 
 Part = Literal["header", "data", "whole"]
@@ -135,8 +136,8 @@ def _range(wavelengths: Floats) -> list[float] | None:
     return [round(float(known.min()), 3), round(float(known.max()), 3)] if known.size else None
 
 
-def _listed(warnings: Warnings) -> list[dict[str, str]]:
-    return [{"code": code, "text": text} for code, text in warnings]
+def _listed(warnings: Notices) -> list[dict[str, str]]:
+    return [{"code": warning.code, "text": warning.message} for warning in warnings]
 
 
 def _refused(error: SpecimapError, path: Path, facts: dict[str, Any]) -> Verdict:

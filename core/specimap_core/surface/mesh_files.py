@@ -25,7 +25,7 @@ _HEADER = (
     + "".join(f"property uchar {n}\n" for n in ("red", "green", "blue"))
     + "element face {faces}\nproperty list uchar int vertex_indices\nend_header\n"
 )
-# Rows put into text or records at a time: bounds what is needed beside the mesh itself.
+# Rows put into text or records at a time: bounds what is needed besides the mesh itself.
 _TOGETHER = 65536
 _METRES = 0.001
 

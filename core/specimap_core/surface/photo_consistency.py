@@ -1,4 +1,4 @@
-"""How well photos agree on a surface: which of them are compared at a vertex, and how alike its patches are in them."""
+"""Photo-consistency of a surface: the photos compared at each vertex, and how alike its patches are in them."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def choose_views(
     caster = RayCaster(mesh)
 
     def run(part: slice) -> None:
-        views[part] = _squarest(caster, chosen[part], photographs, views.shape[1], least_cosine)
+        views[part] = _most_frontal(caster, chosen[part], photographs, views.shape[1], least_cosine)
 
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(run, [slice(k, k + CHUNK) for k in range(0, len(chosen), CHUNK)]))
@@ -67,7 +67,9 @@ def choose_views(
     return np.take_along_axis(views, order, 1)
 
 
-def _squarest(caster: RayCaster, chosen: Indices, photographs: Photographs, most: int, least_cosine: float) -> Indices:
+def _most_frontal(
+    caster: RayCaster, chosen: Indices, photographs: Photographs, most: int, least_cosine: float
+) -> Indices:
     """The photos that see each vertex most squarely and unhidden, (n, most); -1 where there are fewer."""
     mesh, lens, poses = caster.mesh, photographs.lens, photographs.poses
     points, normals = mesh.vertices[chosen].astype(float), mesh.normals[chosen].astype(float)

@@ -1,4 +1,4 @@
-"""Which part of a surface is specimen, marker card or tray, by height and by the markers' layout."""
+"""Divide a surface into specimen, marker card and tray, by height and by the markers' layout."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is known exactly about a phantom, and its file ``truth.npz``."""
+"""The exact truth about a phantom, and its file ``truth.npz``."""
 
 from __future__ import annotations
 

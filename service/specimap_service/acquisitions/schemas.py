@@ -18,7 +18,7 @@ AcquisitionId = Annotated[str, Path(pattern=r"^acq_[0-9a-z]{26}$", examples=["ac
 FileId = Annotated[str, Path(pattern=r"^file_[0-9a-z]{26}$", examples=["file_01k0000000000000000000000"])]
 
 
-class Remark(BaseModel):
+class CubeNotice(BaseModel):
     """Something about a cube that does not keep it from being used."""
 
     code: str
@@ -62,7 +62,7 @@ class CubeJudgement(Judged):
     found_bytes: int | None = Field(None, description="Of the data, where they are too few.")
     field: str | None = Field(None, description="The header's field that is wrong.")
     wavelength_nm: tuple[float, float] | None = Field(None, description="Shortest and longest.")
-    warnings: list[Remark] = []
+    warnings: list[CubeNotice] = []
 
 
 Judgement = Annotated[PhotoJudgement | CubeJudgement, Field(discriminator="kind")]

@@ -10,7 +10,7 @@ from specimap_core.fiducials.observations import Observations
 from specimap_core.geometry.cameras import Intrinsics, Pose, View, look_at
 from specimap_core.reconstruct.backends.da3.backend import Metric, in_millimetres, maps_of, smooth_surface
 from specimap_core.reconstruct.backends.da3.prepare import conditioning, plan_preparation, windows
-from specimap_core.reconstruct.backends.da3.residual_field import bend
+from specimap_core.reconstruct.backends.da3.residual_field import correct_residuals
 from specimap_core.reconstruct.backends.depth_alignment import align, depths_at, on_markers
 from specimap_core.reconstruct.dense.cross_check import confirmed, nearest_photos
 from specimap_core.reconstruct.dense.volume import Singles, volume_over
@@ -118,7 +118,7 @@ def test_what_changes_slowly_is_taken_off_where_places_are_known(exact: Exact) -
     cols = cols // 2  # the left half alone
     true = depth[rows, cols] * (1 + 0.002 * rng.standard_normal(len(rows)))
     true[::10] *= 1.2  # false matches
-    bent, scatter = bend(wrong, np.stack([cols, rows], -1).astype(float), true)
+    bent, scatter = correct_residuals(wrong, np.stack([cols, rows], -1).astype(float), true)
     left, right = np.s_[:, 10:180], np.s_[:, 260:]
 
     def off(found: Singles, part: tuple[slice, slice]) -> float:
@@ -129,7 +129,7 @@ def test_what_changes_slowly_is_taken_off_where_places_are_known(exact: Exact) -
     assert 0.0005 < off(bent, left) < 0.35 * off(wrong, left)
     assert off(bent, right) == pytest.approx(off(wrong, right), rel=0.05)
     assert 0.001 < scatter < 0.004
-    nowhere, infinite = bend(wrong, np.zeros((0, 2)), np.zeros(0))
+    nowhere, infinite = correct_residuals(wrong, np.zeros((0, 2)), np.zeros(0))
     assert np.array_equal(nowhere, wrong)
     assert infinite == np.inf
 

@@ -23,6 +23,7 @@ from specimap_core.reconstruct.backends.mast3r.backend import LICENCE
 from specimap_core.reconstruct.backends.mast3r.maps import bytes_of
 from specimap_core.reconstruct.backends.mast3r.settings import Mast3rSettings
 from tests.support.mast3r_scene import CLOSE_MM, Seen, answer_of, reconstruct, scripted_settings, see, true_points
+from tests.support.notices import messages
 from tests.support.scenes import SMALL, OnDisk
 
 FRAME = Pose(rotation_from_vector(np.array([0.3, -1.1, 0.7])), np.array([20.0, -5.0, 90.0]))
@@ -113,11 +114,11 @@ def test_the_report_tells_licence_weights_and_device(
     seen: Seen, settings: Mast3rSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = reconstruct(seen, answer_of(seen), settings, monkeypatch)
-    remarks = dict(found.remarks)
-    assert LICENCE in found.remarks
-    assert "non-commercial" in remarks["licence_non_commercial"]
-    assert hashlib.sha256(b"weights").hexdigest() in remarks["backend_run"]
-    assert "CPU" in remarks["backend_run"]
+    warnings = messages(found.warnings)
+    assert LICENCE in found.warnings
+    assert "non-commercial" in warnings["licence_non_commercial"]
+    assert hashlib.sha256(b"weights").hexdigest() in warnings["backend_run"]
+    assert "CPU" in warnings["backend_run"]
     assert settings.cache is not None
     asked = json.loads(settings.cache.with_name("answer.npz.request.json").read_text("utf-8"))
     assert asked["pairs"] == [[i, j] for i in range(12) for j in range(i + 1, 12)]
@@ -146,7 +147,7 @@ def test_a_photo_that_is_placed_wrongly_is_placed_by_its_markers(
     # Its depth was made to fit the wrong pose.
     assert 5 not in {m.photo for m in found.maps}
     assert len(found.maps) == 11
-    assert seen.photos[5].name in dict(found.remarks)["depth_unaligned"]
+    assert seen.photos[5].name in messages(found.warnings)["depth_unaligned"]
 
 
 def test_a_photo_of_another_scene_is_refused_by_name(

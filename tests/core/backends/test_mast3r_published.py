@@ -31,6 +31,7 @@ from tests.support.mast3r_scene import (
     see,
     true_points,
 )
+from tests.support.notices import messages
 from tests.support.scenes import SMALL, OnDisk
 
 FRAME = Pose(rotation_from_vector(np.array([-0.6, 0.2, 1.3])), np.array([3.0, 40.0, -70.0]))
@@ -109,7 +110,7 @@ def test_a_photo_that_is_placed_wrongly_is_placed_by_its_markers(
     found = reconstruct(seen, arrays, settings, monkeypatch, hold_to_markers=False)
     assert found.photos == tuple(range(12))
     assert {m.photo for m in found.maps} == set(range(12)) - {5}
-    assert seen.photos[5].name in dict(found.remarks)["depth_unaligned"]
+    assert seen.photos[5].name in messages(found.warnings)["depth_unaligned"]
 
 
 def test_a_run_with_free_corners_goes_the_published_way(

@@ -92,7 +92,7 @@ def test_float_reflectance_keeps_what_is_negative_large_or_missing(tmp_path: Pat
     assert flagged(cloud, Flag.NO_DATA) == {(3, 4), (5, 6), (7, 8)}
     assert flagged(cloud, Flag.SATURATED) == set()
     assert (written.no_data, written.saturated, written.clipped_below, written.clipped_above) == (3, 0, 0, 0)
-    assert [code for code, _ in written.remarks()] == ["points_no_data"]
+    assert [w.code for w in written.warnings()] == ["points_no_data"]
     assert cloud.bad_bands.tolist() == [False] * 4 + [True]
 
 
@@ -106,7 +106,7 @@ def test_few_values_far_beyond_all_others_are_clipped_counted_and_flagged(tmp_pa
     cloud = Cloud.open(tmp_path / "c.zarr")
     assert cloud.scale_factor == 1e-4
     assert (written.clipped_below, written.clipped_above, written.absurd) == (1, 1, 2)
-    codes = [code for code, _ in written.remarks()]
+    codes = [w.code for w in written.warnings()]
     assert codes == ["points_no_data", "values_absurd", "values_clipped", "values_clipped"]
     assert flagged(cloud, Flag.SATURATED) == {(3, 4)}
     assert flagged(cloud, Flag.NO_DATA) == {(9, 8), (9, 9)}

@@ -10,6 +10,7 @@ import pytest
 from specimap_core.cube import open_cube
 from specimap_core.errors import CubeContentError, SettingsError
 from tests.support.cube_files import FILE_AXES, Values, random_values, write_envi
+from tests.support.notices import messages
 
 
 def references(tmp_path: Path, shape: tuple[int, int, int] = (3, 5, 11)) -> tuple[Values, Values, Path, Path]:
@@ -39,7 +40,7 @@ def test_calibration(tmp_path: Path, interleave: str) -> None:
     assert cube.fingerprint() != open_cube(path).fingerprint()
     without_dark = open_cube(path, white=white_path)
     np.testing.assert_allclose(without_dark.read_rows(0, 7), raw / white, rtol=1e-5)
-    assert "dark_missing" in dict(without_dark.warnings)
+    assert "dark_missing" in messages(without_dark.warnings)
 
 
 def test_one_column_references_broadcast(tmp_path: Path) -> None:
@@ -61,7 +62,7 @@ def test_white_not_brighter_than_dark(tmp_path: Path) -> None:
     assert lost[:, 4, 10].all()
     assert lost.sum() == 14
     assert np.isfinite(cube.mean_image()).all()
-    assert "2 of 55" in dict(cube.warnings)["reference_invalid"]
+    assert "2 of 55" in messages(cube.warnings)["reference_invalid"]
     bright = write_envi(tmp_path / "bright.hdr", np.full((1, 5, 11), 9000, "u2"))
     with pytest.raises(CubeContentError, match="nowhere brighter"):
         open_cube(raw, white=dark_path, dark=bright)
@@ -100,7 +101,7 @@ def test_a_white_of_another_exposure_is_noticed(tmp_path: Path, share: float, sa
     raw = write_envi(tmp_path / "raw.hdr", np.rint(rng.uniform(0.1, 0.9, (30, 40, 6)) * white).astype("u2"))
     reference = write_envi(tmp_path / "w.hdr", np.rint(white * share).astype("u2"))
     cube = open_cube(raw, white=reference)
-    assert ("reflectance_implausible" in dict(cube.warnings)) == said
+    assert ("reflectance_implausible" in messages(cube.warnings)) == said
 
 
 @pytest.mark.parametrize(
@@ -121,6 +122,6 @@ def test_an_exposure_that_differs_is_said(tmp_path: Path, of_white: str, of_raw:
     raw = write_envi(tmp_path / "raw.hdr", values, tint=of_raw)
     dark = write_envi(tmp_path / "dark.hdr", np.full_like(values, 90), tint=of_raw)
     cube = open_cube(raw, white=write_envi(tmp_path / "w.hdr", values[:1] + 50, tint=of_white), dark=dark)
-    told = dict(cube.warnings).get("reference_exposure_differs", "")
+    told = messages(cube.warnings).get("reference_exposure_differs", "")
     assert bool(told) == said
     assert not said or "white reference was exposed 0.2 times as long" in told

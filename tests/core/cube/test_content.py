@@ -49,7 +49,7 @@ def test_unusable_wavelengths(tmp_path: Path, words: str | None, code: str) -> N
     cube = open_cube(write_envi(tmp_path / "x.hdr", random_values("u2", (2, 2, 3)), **extra))
     assert np.isnan(cube.wavelengths_nm).all()
     assert cube.wavelengths_nm.shape == (3,)
-    assert [c for c, _ in cube.warnings] == [code]
+    assert [w.code for w in cube.warnings] == [code]
 
 
 def test_bad_bands_are_left_out_of_the_mean(tmp_path: Path) -> None:
@@ -137,7 +137,7 @@ def test_rows_out_of_range(tmp_path: Path) -> None:
 
 def codes(tmp_path: Path, values: Values, **extra: Any) -> set[str]:
     cube = open_cube(write_envi(tmp_path / "x.hdr", values, **extra))
-    return {code for code, _ in inspect(cube, cube.mean_image())}
+    return {w.code for w in inspect(cube, cube.mean_image())}
 
 
 def scene(dtype: str = "u2") -> Values:

@@ -15,6 +15,7 @@ from scipy import io as scipy_io
 from specimap_core.cube import open_cube
 from specimap_core.errors import CubeFormatError, CubeHeaderError, SpecimapError
 from tests.support.cube_files import check_reads, random_values, write_envi
+from tests.support.notices import messages
 
 NM = np.linspace(400, 1000, 11)
 COUNTS = random_values("u2")
@@ -89,14 +90,14 @@ def test_reflectance_comes_first_and_the_choice_is_said(
     path = write(tmp_path, {n: SHARE if n == taken else COUNTS for n in names} | {"wavelengths": NM})
     cube = open_cube(path)
     check_reads(cube, SHARE)
-    text = dict(cube.warnings)["dataset_chosen"]
+    text = messages(cube.warnings)["dataset_chosen"]
     assert f"'{taken}' (" in text
     assert text.index(f"'{taken}'") < text.index(f"not '{other}'")
     assert "--cube FILE::DATASET" in text
     for wanted in (other, f"/{other}", other.upper()):
         chosen = open_cube(Path(f"{path}::{wanted}"))
         check_reads(chosen, COUNTS)
-        assert "dataset_chosen" not in dict(chosen.warnings)
+        assert "dataset_chosen" not in messages(chosen.warnings)
         assert chosen.path == path
         assert chosen.fingerprint() != cube.fingerprint()
 
@@ -106,7 +107,7 @@ def test_the_one_as_long_as_the_wavelengths(tmp_path: Path, write: Writer) -> No
     path = write(tmp_path, {"first": COUNTS, "second": COUNTS[:3, :4, :2], "wavelengths": NM})
     cube = open_cube(path)
     check_reads(cube, COUNTS)
-    assert "'first'" in dict(cube.warnings)["dataset_chosen"]
+    assert "'first'" in messages(cube.warnings)["dataset_chosen"]
 
 
 @pytest.mark.parametrize("write", CONTAINERS)
@@ -204,14 +205,14 @@ def test_tiff_whose_pages_are_rows(tmp_path: Path) -> None:
     cube = open_cube(tmp_path / "x.tif")
     check_reads(cube, COUNTS)
     np.testing.assert_allclose(cube.wavelengths_nm, NM)
-    assert [code for code, _ in cube.warnings] == ["axes_assumed"]
+    assert [w.code for w in cube.warnings] == ["axes_assumed"]
 
 
 def test_npy_that_looks_turned_is_said(tmp_path: Path) -> None:
     np.save(tmp_path / "x.npy", np.zeros((3, 50, 60), "u1"))
-    assert "3 rows x 50 columns x 60 bands" in dict(open_cube(tmp_path / "x.npy").warnings)["axes_assumed"]
+    assert "3 rows x 50 columns x 60 bands" in messages(open_cube(tmp_path / "x.npy").warnings)["axes_assumed"]
     np.save(tmp_path / "y.npy", np.zeros((50, 60, 3), "u1"))
-    assert "axes_assumed" not in dict(open_cube(tmp_path / "y.npy").warnings)
+    assert "axes_assumed" not in messages(open_cube(tmp_path / "y.npy").warnings)
 
 
 @pytest.mark.parametrize("names", [("x", "y"), ("samples", "lines"), ("longitude", "latitude"), ("cols", "rows")])
@@ -231,7 +232,7 @@ def test_names_and_lengths_that_disagree(tmp_path: Path) -> None:
             f["data"].dims[i].label = label
     cube = open_cube(tmp_path / "x.nc")
     check_reads(cube, COUNTS)
-    assert "11 wavelengths" in dict(cube.warnings)["axes_assumed"]
+    assert "11 wavelengths" in messages(cube.warnings)["axes_assumed"]
 
 
 # ---- MATLAB 5 --------------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from specimap_core.cube import open_cube
 from specimap_core.errors import CubeFormatError, CubeHeaderError, CubeNotFoundError, CubeTruncatedError
 from tests.support.cube_files import DTYPES, FILE_AXES, check_reads, random_values, write_envi
+from tests.support.notices import messages
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -69,7 +70,7 @@ def test_envi_defaults_and_comments(tmp_path: Path) -> None:
     path.write_text(text + "wavelength = {\n1.5,2.5,3.5,\n; 400 = not a wavelength }\n4,5,6,7,8,9,10,11 }\n")
     cube = open_cube(path)
     check_reads(cube, values)
-    assert dict(cube.warnings).keys() == {"byte_order_assumed"}
+    assert messages(cube.warnings).keys() == {"byte_order_assumed"}
     np.testing.assert_allclose(cube.wavelengths_nm, np.array([1.5, 2.5, 3.5, *range(4, 12)]) * 1e3)
 
 
@@ -194,7 +195,7 @@ def test_envi_longer_data_warn(tmp_path: Path) -> None:
     path = write_envi(tmp_path / "x.hdr", random_values("u2"))
     with open(path.with_suffix(".raw"), "ab") as f:
         f.write(b"abc")
-    assert "data_longer_than_header" in dict(open_cube(path).warnings)
+    assert "data_longer_than_header" in messages(open_cube(path).warnings)
 
 
 def test_nothing_there(tmp_path: Path) -> None:

@@ -18,13 +18,13 @@ def read(data_dir: Path, folder: Path, name: str) -> tuple[Array, Array, Cloud, 
     """Spectra and flags by pixel of the cloud, and the codes of all warnings."""
     cube = open_cube(data_dir / "field" / f"{name}.hdr")
     written = write_cloud(folder / "c.zarr", scene(cube.rows, cube.cols, 1.0), cube, {})
-    remarks = (*cube.warnings, *inspect(cube, cube.mean_image()), *written.remarks())
+    warnings = (*cube.warnings, *inspect(cube, cube.mean_image()), *written.warnings())
     cloud = Cloud.open(folder / "c.zarr")
     spectra = np.empty((cube.rows, cube.cols, cube.bands), np.float32)
     flags = np.empty((cube.rows, cube.cols), np.uint8)
     at = tuple(cloud.hsi_pixel.astype(int).T)
     spectra[at], flags[at] = cloud.spectra(slice(None)), cloud.flags
-    return spectra, flags, cloud, {code for code, _ in remarks}
+    return spectra, flags, cloud, {w.code for w in warnings}
 
 
 def stored(data_dir: Path, name: str, dtype: str) -> Array:

@@ -108,7 +108,7 @@ def test_hdf5_reflectance_scale_and_guessed_axes(tmp_path: Path) -> None:
     cube = open_cube(tmp_path / "x.h5")
     check_reads(cube, values)
     assert cube.to_reflectance == pytest.approx(1e-4)
-    assert [code for code, _ in cube.warnings] == ["axes_assumed", "wavelengths_missing"]
+    assert [w.code for w in cube.warnings] == ["axes_assumed", "wavelengths_missing"]
 
 
 def test_hdf5_does_not_leave_its_file(tmp_path: Path) -> None:

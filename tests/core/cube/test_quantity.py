@@ -27,7 +27,7 @@ def scene() -> Values:
 
 
 def codes(cube: Cube) -> set[str]:
-    return {code for code, _ in (*cube.warnings, *inspect(cube, cube.mean_image()))}
+    return {w.code for w in (*cube.warnings, *inspect(cube, cube.mean_image()))}
 
 
 def envi(path: Path, **said: Any) -> Path:

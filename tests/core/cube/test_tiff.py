@@ -13,6 +13,7 @@ import tifffile
 from specimap_core.cube import open_cube
 from specimap_core.errors import CubeFormatError, SpecimapError
 from tests.support.cube_files import Values, check_reads, random_values
+from tests.support.notices import messages
 
 LOSSLESS = ["lzw", "zlib", "adobe_deflate", "packbits", "lzma", "zstd"]
 
@@ -51,7 +52,7 @@ def test_compressions(tmp_path: Path, compression: str, predictor: bool, dtype: 
             assert (page.compression > 1, page.predictor > 1) == (True, predictor)
         cube = open_cube(path)
         check_reads(cube, values)
-        assert [code for code, _ in cube.warnings] == ["wavelengths_missing"]
+        assert [w.code for w in cube.warnings] == ["wavelengths_missing"]
 
 
 @pytest.mark.parametrize("dtype", ["u1", "u2", "f2", "f4", "f8", "u4"])
@@ -73,7 +74,7 @@ def test_jpeg_is_read_and_said(tmp_path: Path) -> None:
         tmp_path / "x.tif", pages, photometric="minisblack", compression="jpeg", compressionargs={"level": 98}
     )
     cube = open_cube(tmp_path / "x.tif")
-    assert "JPEG" in dict(cube.warnings)["values_lossy"]
+    assert "JPEG" in messages(cube.warnings)["values_lossy"]
     apart = cube.read_rows(0, 40).astype(int) - values
     assert 0 < np.abs(apart).max() < 12
 
@@ -116,7 +117,7 @@ def test_several_images_are_said(tmp_path: Path) -> None:
         writer.write(values[..., 0], photometric="minisblack")
     cube = open_cube(tmp_path / "x.tif")
     check_reads(cube, values)
-    assert "6x9x8" in dict(cube.warnings)["dataset_chosen"]
+    assert "6x9x8" in messages(cube.warnings)["dataset_chosen"]
 
 
 def test_refusals_name_the_axes(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from specimap_core.geometry.cameras import Floats
 from specimap_core.screening.cube import judge_cube
 from tests.support.cloud_scene import scene
 from tests.support.cube_files import Values, random_values, write_envi
+from tests.support.notices import messages
 from tests.support.value_files import WRITERS, listed
 
 FORMATS = sorted(WRITERS)
@@ -33,7 +34,7 @@ def truth(rows: int = 20, cols: int = 24, bands: int = 6) -> Floats:
 
 
 def codes(cube: Cube) -> set[str]:
-    return {code for code, _ in (*cube.warnings, *inspect(cube, cube.mean_image()))}
+    return {w.code for w in (*cube.warnings, *inspect(cube, cube.mean_image()))}
 
 
 def as_image(cube: Cube, folder: Path) -> tuple[Floats, NDArray[np.uint8], Cloud]:
@@ -303,7 +304,7 @@ def test_negative_reflectance_is_kept(tmp_path: Path, low: float, dtype: str) ->
 def test_implausible_reflectance_is_said(tmp_path: Path, factor: float, offset: float, said: str) -> None:
     values = ((truth() * factor + offset) * 1e4).astype("f4")
     cube = open_cube(write_envi(tmp_path / "x.hdr", values.astype("i4"), reflectance_scale_factor=10000))
-    assert said in dict(cube.warnings)["reflectance_implausible"]
+    assert said in messages(cube.warnings)["reflectance_implausible"]
 
 
 def test_integers_of_reflectance_are_copied_bit_for_bit(tmp_path: Path) -> None:
@@ -427,7 +428,7 @@ def test_references_mean_what_they_say(tmp_path: Path, name: str) -> None:
     right[:, 5, 2] = np.nan
     np.testing.assert_allclose(image, right, rtol=0, atol=2e-4)
     assert (flagged(flags, Flag.NO_DATA) == np.isnan(right).any(-1)).all()
-    assert "reference_invalid" in dict(cube.warnings)
+    assert "reference_invalid" in messages(cube.warnings)
 
 
 def test_a_saturated_white_and_references_of_another_kind_are_said(tmp_path: Path) -> None:

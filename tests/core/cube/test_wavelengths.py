@@ -20,6 +20,7 @@ from specimap_core.cube.spectral_units import read_unit
 from specimap_core.cube.wavelengths import nanometres
 from specimap_core.errors import CubeHeaderError
 from tests.support.cube_files import random_values, write_envi
+from tests.support.notices import messages
 
 NM = np.linspace(461.905, 1700, 16)
 BANDS = np.arange(1.0, 17)
@@ -89,7 +90,7 @@ def test_units(words: str, in_unit: np.typing.NDArray[np.float64]) -> None:
 )
 def test_what_the_numbers_contradict(values: Any, unit: str | None, right: Any, code: str) -> None:
     nm, warnings = nanometres(np.asarray(values, np.float64), unit, 16)
-    assert [c for c, _ in warnings] == [code]
+    assert [w.code for w in warnings] == [code]
     np.testing.assert_allclose(nm, np.full(16, np.nan) if right is None else right, rtol=1e-12)
 
 
@@ -262,7 +263,7 @@ def test_units_in_every_container(
     np.testing.assert_array_equal(cube.read_rows(0, 7), values)
     expected = np.full(16, np.nan) if right is None else right
     np.testing.assert_allclose(cube.wavelengths_nm, expected, rtol=1e-12)
-    assert [c for c, _ in cube.warnings if c.startswith("wavelength")] == ([code] if code else [])
+    assert [w.code for w in cube.warnings if w.code.startswith("wavelength")] == ([code] if code else [])
 
 
 @pytest.mark.parametrize(
@@ -342,11 +343,11 @@ def test_inputs_from_the_field(data_dir: Path) -> None:
     for name in ("says_nm_is_um", "says_um_is_nm"):
         cube = field(data_dir, name)
         np.testing.assert_allclose(cube.wavelengths_nm[[0, -1]], [461.905, 1700])
-        assert "wavelength_units_contradict" in dict(cube.warnings)
+        assert "wavelength_units_contradict" in messages(cube.warnings)
     for name in ("units_index", "units_unknown_index"):
         cube = field(data_dir, name)
         assert np.isnan(cube.wavelengths_nm).all()
-        assert "band numbers" in dict(cube.warnings)["wavelengths_band_numbers"]
+        assert "band numbers" in messages(cube.warnings)["wavelengths_band_numbers"]
     with pytest.raises(CubeHeaderError) as caught:
         field(data_dir, "wavelength_twice")
     assert caught.value.details["field"] == "wavelength"

@@ -11,7 +11,14 @@ import pytest
 from specimap_core.errors import SettingsError
 from specimap_core.geometry.cameras import Intrinsics, Pose, View, look_at, rotation_from_vector
 from specimap_core.geometry.pushbroom import Axis, ScanView, WobblyScan
-from specimap_core.register.camera_models import NUMBERS, SCANS, STEPS, Flat, at_markers, moved
+from specimap_core.register.camera_models import (
+    PARAMETER_SCALES,
+    PARAMETERS,
+    SCANS,
+    PlaneAffinity,
+    apply_step,
+    at_markers,
+)
 from specimap_core.truth.truth_file import save_truth
 from specimap_validation.phantom import Phantom, PhantomSettings, load_truth
 from specimap_validation.phantom.views import hsi_view
@@ -68,13 +75,13 @@ def test_a_resized_image_and_a_moved_world_show_the_same(view: View) -> None:
 @pytest.mark.parametrize("axis", AXES)
 def test_the_ten_numbers_are_those_of_a_scan(axis: Axis) -> None:
     view = scan(axis)
-    steps = np.diag(STEPS) * 1e-3
-    J = np.stack([(moved(view, step).project(POINTS) - view.project(POINTS)).ravel() for step in steps], 1)
-    assert J.shape[1] == NUMBERS
+    steps = np.diag(PARAMETER_SCALES) * 1e-3
+    J = np.stack([(apply_step(view, step).project(POINTS) - view.project(POINTS)).ravel() for step in steps], 1)
+    assert J.shape[1] == PARAMETERS
     singular = np.linalg.svd(J / np.linalg.norm(J, axis=0), compute_uv=False)
     # None is another's, or nothing: places at several heights tell all of them apart.
     assert singular.min() > 1e-4
-    again = at_markers(moved(view, np.array([0.01, -0.02, 0.03, 1, 2, 5, 0.1, 0.05, 0.01, 0.01])))
+    again = at_markers(apply_step(view, np.array([0.01, -0.02, 0.03, 1, 2, 5, 0.1, 0.05, 0.01, 0.01])))
     assert isinstance(again, ScanView)
     assert again.depth_mm == again.cam_from_world.t[2]
     assert at_markers(again).project(POINTS) == pytest.approx(again.project(POINTS))
@@ -88,7 +95,7 @@ def test_a_scan_starts_where_it_sees_the_plane_as_shown(model: object) -> None:
     true = scan(axis, climb=0.0)
     true = replace(true, cam_from_world=look_at(np.array([0.0, 0, 400]), np.zeros(3), np.array([0.3, 1.0, 0])))
     flat = POINTS * [1, 1, 0]
-    start = Flat.of(flat, true.project(flat)).scan(axis, 256, 320, 2100.0)
+    start = PlaneAffinity.of(flat, true.project(flat)).scan(axis, 256, 320, 2100.0)
     assert np.abs(start.project(flat) - true.project(flat)).max() < 1e-6
     assert start.skew == pytest.approx(true.skew)
     assert at_markers(start).intrinsics.aspect == pytest.approx(0.8)

@@ -153,9 +153,9 @@ def test_what_is_passed_over_is_named(tmp_path: Path) -> None:
         "empty": "a folder",
         "film.mov": "its name does not end as a photo's",
     }
-    ((code, sentence),) = found.remarks()
-    assert code == "files_passed_over"
-    assert all(name in sentence for name, _ in found.passed_over)
+    (warning,) = found.warnings()
+    assert warning.code == "files_passed_over"
+    assert all(name in warning.message for name, _ in found.passed_over)
     with pytest.raises(SpecimapError, match=r"day 2 \(a folder with 1 photo\)") as few:
         read_photos(found.photos, SETTINGS)
     assert "c.DNG" in few.value.details["refused"]  # type: ignore[operator]

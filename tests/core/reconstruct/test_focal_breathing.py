@@ -17,10 +17,10 @@ from specimap_core.photos.folder import photo_paths
 from specimap_core.photos.reading import AcquisitionSettings, Photo, read_photos, stated_focal_px
 from specimap_core.reconstruct.backend import CornersInPhotos, corners_in_photos, detect_in_photos
 from specimap_core.reconstruct.focal_breathing import (
-    bring_to_shared,
-    estimate_breathing,
-    image_at_shared,
-    settle_breathing,
+    corners_at_shared_focal,
+    correct_focal_breathing,
+    estimate_focal_breathing,
+    image_at_shared_focal,
 )
 from specimap_core.reconstruct.poses_from_markers import solve_from_markers
 from specimap_validation.phantom import Phantom, PhantomSettings
@@ -69,7 +69,7 @@ def shown(seed: int, spread: float, photos: int = 16, side: int = 512) -> Shown:
 def settled(seed: int) -> tuple[list[Photo], CornersInPhotos, Floats]:
     """The breathing phantom of a seed brought to one lens."""
     scene = shown(seed, SPREAD)
-    return settle_breathing(scene.photos, scene.corners, edge_mm=EDGE_MM, focal_px=None)
+    return correct_focal_breathing(scene.photos, scene.corners, edge_mm=EDGE_MM, focal_px=None)
 
 
 def layout_seen(
@@ -79,7 +79,7 @@ def layout_seen(
     _, seen = marker_scene(photos=photos, markers=markers, noise_px=noise_px, seed=seed, lens=SHARP)
     zooms = spread * np.random.default_rng([seed, 1]).standard_normal(photos)
     zooms -= zooms.mean()
-    seen = bring_to_shared(seen, np.exp(-zooms), (SHARP.width, SHARP.height))
+    seen = corners_at_shared_focal(seen, np.exp(-zooms), (SHARP.width, SHARP.height))
     blank = photo_of("blank", np.zeros((SHARP.height, SHARP.width, 3), np.uint8))
     return [blank] * photos, CornersInPhotos(seen, tuple(range(markers))), zooms
 
@@ -109,11 +109,11 @@ def test_zooms_of_layouts_are_found_as_well_as_stated() -> None:
     for seed in range(3):
         photos, corners, true = layout_seen(seed, SPREAD)
         solution = solve_from_markers(corners.seen, corners.marker_ids, photos[0].size, edge_mm=EDGE_MM)
-        found = estimate_breathing(solution.scene, solution.seen)
+        found = estimate_focal_breathing(solution.scene, solution.seen)
         assert found is not None
         assert found.significance > 10
         assert found.spread == pytest.approx(true.std(), rel=0.5)
-        _, _, zooms = settle_breathing(photos, corners, edge_mm=EDGE_MM, focal_px=None)
+        _, _, zooms = correct_focal_breathing(photos, corners, edge_mm=EDGE_MM, focal_px=None)
         off = error_of(zooms, true)
         shares.append(off.std() / true.std())
         chi.append(float(np.mean((off / found.sd) ** 2)))
@@ -124,7 +124,7 @@ def test_zooms_of_layouts_are_found_as_well_as_stated() -> None:
 
 def test_a_stated_focal_length_does_as_well() -> None:
     photos, corners, true = layout_seen(3, SPREAD)
-    _, _, zooms = settle_breathing(photos, corners, edge_mm=EDGE_MM, focal_px=1.02 * SHARP.focal_px)
+    _, _, zooms = correct_focal_breathing(photos, corners, edge_mm=EDGE_MM, focal_px=1.02 * SHARP.focal_px)
     assert 1e-5 < error_of(zooms, true).std() < 0.5 * true.std()
 
 
@@ -152,7 +152,7 @@ def test_poses_come_nearer_to_truth(seed: int) -> None:
 @pytest.mark.parametrize("seed", [51, 52, 53])
 def test_steady_phantoms_stay_as_they_are(seed: int) -> None:
     scene = shown(seed, 0.0, 12, 384)
-    photos, corners, zooms = settle_breathing(scene.photos, scene.corners, edge_mm=EDGE_MM, focal_px=None)
+    photos, corners, zooms = correct_focal_breathing(scene.photos, scene.corners, edge_mm=EDGE_MM, focal_px=None)
     assert (zooms == 1).all()
     assert photos is scene.photos
     assert corners.seen is scene.corners.seen
@@ -162,14 +162,14 @@ def test_steady_phantoms_stay_as_they_are(seed: int) -> None:
 def test_steady_layouts_stay_as_they_are(noise_px: float) -> None:
     for seed in range(4):
         photos, corners, _ = layout_seen(100 + seed, 0.0, noise_px=noise_px)
-        assert (settle_breathing(photos, corners, edge_mm=EDGE_MM, focal_px=None)[2] == 1).all()
+        assert (correct_focal_breathing(photos, corners, edge_mm=EDGE_MM, focal_px=None)[2] == 1).all()
 
 
 @pytest.mark.parametrize("name", ["phantom_a", "phantom_hard"])
 def test_steady_path_traced_photos_stay_as_they_are(data_dir: Path, name: str) -> None:
     photos, _ = read_photos(photo_paths(data_dir / name / "rgb"), AcquisitionSettings(), workers=2)
     corners = detected(photos)
-    after, _, zooms = settle_breathing(photos, corners, edge_mm=EDGE_MM, focal_px=stated_focal_px(photos))
+    after, _, zooms = correct_focal_breathing(photos, corners, edge_mm=EDGE_MM, focal_px=stated_focal_px(photos))
     assert (zooms == 1).all()
     assert after is photos
 
@@ -182,12 +182,12 @@ def test_markers_of_a_warped_photo_lie_where_the_corners_were_brought(zoom: floa
     scene = shown(BREATHING_SEEDS[0], SPREAD)
     zooms = np.full(len(scene.photos), zoom)
     seen = scene.corners.seen
-    brought = bring_to_shared(seen, zooms, scene.photos[0].size)
+    brought = corners_at_shared_focal(seen, zooms, scene.photos[0].size)
     moved = np.linalg.norm(brought.corners_px - seen.corners_px, axis=-1)
     off = []
     for photo in range(0, len(scene.photos), 3):
         before = scene.photos[photo]
-        warped = replace(before, image=image_at_shared(before.image, zoom))
+        warped = replace(before, image=image_at_shared_focal(before.image, zoom))
         for found in detect_markers(warped.grey, "DICT_4X4_50", expected=4):
             rows = (seen.photo == photo) & (seen.marker == scene.corners.marker_ids.index(found.marker_id))
             if rows.any():
@@ -204,10 +204,10 @@ def test_photos_and_corners_are_brought_by_the_zooms_returned() -> None:
     photos, corners, zooms = settled(BREATHING_SEEDS[0])
     assert [p.name for p in photos] == [p.name for p in scene.photos]
     for before, after, zoom in zip(scene.photos, photos, zooms, strict=True):
-        assert np.array_equal(after.image, image_at_shared(before.image, float(zoom)))
-    again = bring_to_shared(scene.corners.seen, zooms, photos[0].size)
+        assert np.array_equal(after.image, image_at_shared_focal(before.image, float(zoom)))
+    again = corners_at_shared_focal(scene.corners.seen, zooms, photos[0].size)
     assert np.array_equal(corners.seen.corners_px, again.corners_px)
-    back = bring_to_shared(corners.seen, 1 / zooms, photos[0].size)
+    back = corners_at_shared_focal(corners.seen, 1 / zooms, photos[0].size)
     assert back.corners_px == pytest.approx(scene.corners.seen.corners_px, abs=1e-9)
     solution = corners.solution
     assert solution is not None
@@ -218,9 +218,9 @@ def test_photos_and_corners_are_brought_by_the_zooms_returned() -> None:
 def test_the_middle_stays_and_a_zoom_too_small_to_see_moves_nothing() -> None:
     image = np.zeros((31, 41, 3), np.uint8)
     image[15, 20] = 255
-    assert image_at_shared(image, 1.0001) is image
+    assert image_at_shared_focal(image, 1.0001) is image
     for zoom in (0.97, 1.03):
-        warped = image_at_shared(image, zoom)
+        warped = image_at_shared_focal(image, zoom)
         assert warped.shape == image.shape
         assert int(warped[..., 0].argmax()) == 15 * 41 + 20
 
@@ -229,7 +229,7 @@ def test_the_middle_stays_and_a_zoom_too_small_to_see_moves_nothing() -> None:
 
 
 def unchanged(photos: list[Photo], corners: CornersInPhotos) -> bool:
-    after, brought, zooms = settle_breathing(photos, corners, edge_mm=EDGE_MM, focal_px=None)
+    after, brought, zooms = correct_focal_breathing(photos, corners, edge_mm=EDGE_MM, focal_px=None)
     same = after is photos and brought.seen is corners.seen and zooms.shape == (len(photos),)
     return same and bool((zooms == 1).all())
 
@@ -256,7 +256,7 @@ def test_a_photo_that_shows_one_marker_keeps_its_zoom() -> None:
     photos, corners, true = layout_seen(2, SPREAD)
     seen = corners.seen
     kept = (seen.photo != 4) | (seen.marker == 0)
-    _, _, zooms = settle_breathing(photos, replace(corners, seen=seen.of(kept)), edge_mm=EDGE_MM, focal_px=None)
+    _, _, zooms = correct_focal_breathing(photos, replace(corners, seen=seen.of(kept)), edge_mm=EDGE_MM, focal_px=None)
     assert zooms[4] == 1
     rest = np.arange(len(photos)) != 4
     assert 1e-5 < error_of(zooms[rest], true[rest]).std() < 0.5 * true.std()

@@ -13,7 +13,7 @@ from specimap_core.reconstruct.dense import multi_view
 from specimap_core.reconstruct.dense.depth_map import Bytes, DepthSettings
 from specimap_core.reconstruct.dense.multi_view import dense_depth
 from specimap_core.reconstruct.dense.pairs import choose_pairs
-from specimap_core.reconstruct.dense.stereo import sight_angles
+from specimap_core.reconstruct.dense.stereo import viewing_angles_deg
 from specimap_core.reconstruct.dense.volume import Volume, lattice_over, volume_over
 from specimap_core.surface.fusion import SurfaceSettings
 from specimap_validation.phantom import Phantom, PhantomSettings
@@ -128,7 +128,7 @@ def test_few_photos_all_around_are_said_to_lie_too_far_apart() -> None:
     angles = np.linspace(0, 2 * np.pi, 7, endpoint=False)
     poses = tuple(look_at(np.array([130 * np.cos(a), 130 * np.sin(a), 150.0]), np.zeros(3), UP) for a in angles)
     corners = low().truth.marker_corners
-    neighbours = np.sort(sight_angles(poses, volume_over(corners, poses).centre), axis=1)[:, 1]
+    neighbours = np.sort(viewing_angles_deg(poses, volume_over(corners, poses).centre), axis=1)[:, 1]
     assert 33 < neighbours.min() < neighbours.max() < 42
     said = refusal([np.zeros((448, 448, 3), np.uint8)] * 7, lens, poses, corners)
     assert f"{np.median(neighbours):.0f} degrees apart: too far" in said.message

@@ -13,6 +13,7 @@ import pytest
 
 from specimap_core.errors import BackendFailedError, BackendUnavailableError, CancelledError
 from specimap_core.geometry.cameras import Floats
+from specimap_core.notices import Notices
 from specimap_core.photos.folder import photo_paths
 from specimap_core.photos.reading import AcquisitionSettings, read_photos
 from specimap_core.pipeline.outputs import Inputs
@@ -81,7 +82,7 @@ def test_maps_lie_on_the_surface_and_false_depth_is_not_trusted(scene: Scene) ->
 # ---- choosing, running, stopping ----------------------------------------------------------------------
 
 
-def call(scene: Scene, device: str, **more: object) -> tuple[list[DepthMap], tuple[tuple[str, str], ...]]:
+def call(scene: Scene, device: str, **more: object) -> tuple[list[DepthMap], Notices]:
     settings = replace(DepthSettings(), device=device)  # type: ignore[arg-type]
     return patchmatch.measure_depth(
         scene.images,
@@ -102,8 +103,8 @@ def test_without_cuda_a_gpu_is_refused_and_auto_takes_the_cpu(scene: Scene, monk
     monkeypatch.setattr(patchmatch, "cuda_devices", lambda: 0)
     with pytest.raises(BackendUnavailableError, match="No CUDA device"):
         call(scene, "gpu")
-    maps, said = call(scene, "auto")
-    assert said == ()
+    maps, warnings = call(scene, "auto")
+    assert warnings == ()
     usual = dense_depth(scene.images, scene.lens, scene.poses, scene.volume, DepthSettings(), workers=2)
     assert len(maps) == len(usual) > len(scene.poses)
 
@@ -137,8 +138,8 @@ def test_a_gpu_in_sight_is_taken_and_said(scene: Scene, tmp_path: Path, monkeypa
         ),
     )
     heard: list[float] = []
-    maps, said = call(scene, "auto", progress=heard.append)
-    assert [code for code, _ in said] == ["dense_on_gpu"]
+    maps, warnings = call(scene, "auto", progress=heard.append)
+    assert [w.code for w in warnings] == ["dense_on_gpu"]
     assert heard == sorted(heard)
     assert heard[-1] == 1.0
     assert max(scene.off_mm(m).max() for m in maps) < 1e-3
@@ -150,8 +151,8 @@ def test_where_the_gpu_fails_auto_goes_on_with_the_cpu(
     on_gpu(scene, monkeypatch, child(tmp_path, "print('CUDA error: out of memory', flush=True); os._exit(1)"))
     with pytest.raises(BackendFailedError, match="out of memory"):
         call(scene, "gpu")
-    maps, said = call(scene, "auto")
-    assert [code for code, _ in said] == ["dense_gpu_failed"]
+    maps, warnings = call(scene, "auto")
+    assert [w.code for w in warnings] == ["dense_gpu_failed"]
     assert maps
 
 

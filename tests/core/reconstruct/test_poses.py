@@ -59,7 +59,7 @@ def test_where_markers_suffice_no_features_are_looked_at(scene: Ring, monkeypatc
     asked = kinds_are(monkeypatch)
     posed = pose(scene, scene.corners)
     assert posed.photos == tuple(ALL)
-    assert posed.remarks == ()
+    assert posed.warnings == ()
     assert asked == []
 
 
@@ -77,11 +77,11 @@ def test_sift_locates_what_markers_leave_open(scene: Ring, monkeypatch: pytest.M
     # Four photos know the focal length to a per cent or so, which turns into a fraction of a degree.
     assert 1e-3 < np.median(errors) < 1
     assert errors.max() < 2
-    ((code, sentence),) = posed.remarks
-    assert code == "features_chosen"
-    assert "6 of 10 photos" in sentence
-    assert "% of the picture between the markers shows fine texture above the noise" in sentence
-    assert "SIFT, tried first and taken where 60 matches agree, located 6 of 6" in sentence
+    (warning,) = posed.warnings
+    assert warning.code == "features_chosen"
+    assert "6 of 10 photos" in warning.message
+    assert "% of the picture between the markers shows fine texture above the noise" in warning.message
+    assert "SIFT, tried first and taken where 60 matches agree, located 6 of 6" in warning.message
 
 
 def test_auto_goes_on_where_sift_gives_up(scene: Ring, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -90,8 +90,8 @@ def test_auto_goes_on_where_sift_gives_up(scene: Ring, monkeypatch: pytest.Monke
     posed = pose(scene, scene.shown_in(SHOWN))
     assert asked == ["sift", "aliked"]
     assert posed.photos == tuple(ALL)
-    assert "SIFT, tried first and taken where 60 matches agree, located 0 of 6" in posed.remarks[0][1]
-    assert "ALIKED with LightGlue, for the rest, located 6 of 6" in posed.remarks[0][1]
+    assert "SIFT, tried first and taken where 60 matches agree, located 0 of 6" in posed.warnings[0].message
+    assert "ALIKED with LightGlue, for the rest, located 6 of 6" in posed.warnings[0].message
 
 
 @pytest.mark.parametrize("second", [Sift, Blind])
@@ -104,7 +104,7 @@ def test_auto_takes_a_pose_of_few_matches_only_where_aliked_finds_none(
     posed = pose(scene, scene.shown_in(SHOWN))
     assert asked == (["sift", "aliked"] if second is Sift else ["sift", "aliked", "sift"])
     assert posed.photos == tuple(ALL)
-    assert ("SIFT, now with fewer matches, located 6 of 6" in posed.remarks[0][1]) == (second is Blind)
+    assert ("SIFT, now with fewer matches, located 6 of 6" in posed.warnings[0].message) == (second is Blind)
     assert scene.errors_deg(posed.photos, posed.poses, posed.corners, [0, 1, 2, 3]).max() < 2
 
 
@@ -115,7 +115,7 @@ def test_without_aliked_a_pose_of_few_matches_is_taken_at_once(scene: Ring, monk
     posed = pose(scene, scene.shown_in(SHOWN))
     assert asked == ["sift"]
     assert posed.photos == tuple(ALL)
-    assert "SIFT, tried first, located 6 of 6" in posed.remarks[0][1]
+    assert "SIFT, tried first, located 6 of 6" in posed.warnings[0].message
 
 
 def test_sift_alone_does_not_go_on(scene: Ring, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -132,7 +132,7 @@ def test_auto_says_that_aliked_is_absent(scene: Ring, monkeypatch: pytest.Monkey
     asked = kinds_are(monkeypatch, sift=Blind)
     posed = pose(scene, scene.shown_in(SHOWN))
     assert asked == ["sift"]
-    assert "not installed" in posed.remarks[0][1]
+    assert "not installed" in posed.warnings[0].message
 
 
 def test_aliked_that_is_absent_is_refused_first(scene: Ring, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -187,7 +187,7 @@ def test_photos_without_markers_hang_together_by_motion(scene: Ring, monkeypatch
     found, true = (np.stack([p.centre for p in poses]) for poses in cameras)
     sizes = [np.linalg.norm(c - c.mean(0), axis=1).mean() for c in (found, true)]
     assert sizes[0] / sizes[1] == pytest.approx(1, abs=0.05)
-    assert "SIFT connected 10 of 10" in posed.remarks[0][1]
+    assert "SIFT connected 10 of 10" in posed.warnings[0].message
 
 
 def test_where_neither_reaches_it_is_refused(scene: Ring, monkeypatch: pytest.MonkeyPatch) -> None:

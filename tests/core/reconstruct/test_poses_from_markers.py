@@ -12,7 +12,7 @@ from specimap_core.errors import MarkerGeometryError
 from specimap_core.fiducials.observations import Observations, corners_of, square_corners
 from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, fit_similarity
 from specimap_core.reconstruct.backend import CornersInPhotos
-from specimap_core.reconstruct.false_markers import misread, start_without, without
+from specimap_core.reconstruct.false_markers import misread_ids, start_without_markers, without_markers
 from specimap_core.reconstruct.poses_from_markers import MarkerSolution, solve_from_markers
 from specimap_core.reconstruct.square_poses import two_poses
 from tests.support.scenes import EDGE_MM, marker_scene, rotation_deg
@@ -87,7 +87,7 @@ def test_a_photo_with_one_marker_is_not_flipped() -> None:
         seen = seen.of((seen.photo != photo) | (seen.marker == photo))
     solution = solved(seen, (0, 1, 2, 3))
     errors = pose_errors(solution, truth)
-    sure = np.array([p not in solution.weak for p in solution.photos])
+    sure = np.array([p not in solution.ambiguous for p in solution.photos])
     assert errors[sure].max() < 3
     assert sure.sum() >= 9
 
@@ -162,13 +162,13 @@ def test_ids_that_no_two_photos_show_at_one_place_are_false_readings() -> None:
     ids = (0, 1, 2, 3, 4, 5, 104, 590)
     corners = CornersInPhotos(with_readings(seen, false), ids)
     solution = solved(corners.seen, ids)
-    assert misread(corners, solution) == {104, 590}
-    left = without(corners, {104, 590})
+    assert misread_ids(corners, solution) == {104, 590}
+    left = without_markers(corners, {104, 590})
     assert left.marker_ids == ids[:6]
     assert np.array_equal(left.seen.corners_px, seen.corners_px)
     assert np.array_equal(left.seen.marker, seen.marker)
     again = solve_from_markers(
-        left.seen, left.marker_ids, SIZE, edge_mm=EDGE_MM, start=start_without(solution, {104, 590})
+        left.seen, left.marker_ids, SIZE, edge_mm=EDGE_MM, start=start_without_markers(solution, {104, 590})
     )
     assert again.markers == ids[:6]
     assert 0 < corner_errors(again.scene, truth.corners).max() < 0.05
@@ -180,7 +180,7 @@ def test_a_marker_that_was_moved_is_no_false_reading() -> None:
     moved = seen.corners_px.copy()
     moved[(seen.marker == 2) & (seen.photo >= 5)] += 40.0
     corners = CornersInPhotos(replace(seen, corners_px=moved), tuple(range(6)))
-    assert not misread(corners, solved(corners.seen, corners.marker_ids))
+    assert not misread_ids(corners, solved(corners.seen, corners.marker_ids))
 
 
 def test_markers_of_photos_that_are_not_posed_are_no_false_readings() -> None:
@@ -190,7 +190,7 @@ def test_markers_of_photos_that_are_not_posed_are_no_false_readings() -> None:
     corners = CornersInPhotos(seen, tuple(range(6)))
     solution = solved(corners.seen, corners.marker_ids)
     assert not {8, 9} & set(solution.photos)
-    assert not misread(corners, solution)
+    assert not misread_ids(corners, solution)
 
 
 def test_an_earlier_solution_leads_to_the_same_answer() -> None:

@@ -13,11 +13,10 @@ from specimap_core.cloud import Cloud, Flag
 from specimap_core.cube import open_cube
 from specimap_core.geometry.cameras import fit_similarity
 from specimap_core.pipeline.outputs import Inputs
-from specimap_core.pipeline.register_stage import corners_in_cube
 from specimap_core.pipeline.run import run_pipeline
 from specimap_core.pipeline.settings import PipelineSettings
-from specimap_core.register.accuracy import CornersInCube
-from specimap_core.register.camera_refinement import LOOSE_MM, Settled, settle_camera
+from specimap_core.register.camera_refinement import LOOSE_MM, RefinedCamera, refine_camera
+from specimap_core.register.corners import CornersInCube, corners_in_cube
 from specimap_core.register.cube_camera import CubeCamera, solve_camera
 from specimap_core.register.cube_markers import CubeMarkers, find_markers
 from specimap_core.register.specimen_motion import SHARED_MM
@@ -51,10 +50,10 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Case:
-    """A camera by the markers ``alone``, and ``settled``; how far the textured bump is off in either, mm."""
+    """A camera by the markers ``alone``, and ``refined``; how far the textured bump is off in either, mm."""
 
     alone: CubeCamera
-    settled: Settled
+    refined: RefinedCamera
     before_mm: float
     after_mm: float
 
@@ -85,8 +84,8 @@ def case(image: Image, caster: RayCaster, ids: tuple[int, ...], noise_px: float,
     corners = CornersInCube(ids, CORNERS[list(ids)], pixels, sigma)
     found = CubeMarkers(ids, pixels, sigma, image, "band mean", False)
     alone = solve_camera(*corners.flat(), ROWS, COLS)
-    settled = settle_camera(corners, found, ROWS, COLS, caster, CORNERS)
-    return Case(alone, settled, off_mm(alone), off_mm(settled.camera))
+    refined = refine_camera(corners, found, ROWS, COLS, caster, CORNERS)
+    return Case(alone, refined, off_mm(alone), off_mm(refined.camera))
 
 
 # ---- markers, and a textured bump ---------------------------------------------------------------------
@@ -97,27 +96,27 @@ def test_four_sharp_markers_hold_the_camera_and_the_specimen_agrees(
     caster: RayCaster, picture: Image, seed: int
 ) -> None:
     found = case(picture, caster, ALL, SHARP_PX, seed)
-    settled = found.settled
-    assert settled.by_specimen
-    assert settled.remarks() == []
-    assert settled.shift is not None
-    assert not settled.shift.significant
-    assert 0 < settled.sideways_mm < settled.open_mm < LOOSE_MM
-    assert 0.001 < found.after_mm < 2 * settled.sideways_mm
+    refined = found.refined
+    assert refined.specimen_used
+    assert refined.warnings() == []
+    assert refined.shift is not None
+    assert not refined.shift.significant
+    assert 0 < refined.lateral_sd_mm < refined.marker_sd_mm < LOOSE_MM
+    assert 0.001 < found.after_mm < 2 * refined.lateral_sd_mm
 
 
 @pytest.mark.parametrize("ids", [ALL, THREE])
 def test_what_markers_leave_open_the_specimen_settles(caster: RayCaster, picture: Image, ids: tuple[int, ...]) -> None:
-    cases = [found for seed in SEEDS if (found := case(picture, caster, ids, BLURRED_PX, seed)).settled.by_specimen]
+    cases = [found for seed in SEEDS if (found := case(picture, caster, ids, BLURRED_PX, seed)).refined.specimen_used]
     # Corners that are off by chance hide at times how far: not every draw is recognised as loose.
     assert len(cases) >= 6
     for found in cases:
-        settled = found.settled
-        assert settled.shift is not None
-        assert found.after_mm < min(found.before_mm, 3 * settled.shift.sigma_mm)
+        refined = found.refined
+        assert refined.shift is not None
+        assert found.after_mm < min(found.before_mm, 3 * refined.shift.sigma_mm)
         # Two measurements of one place are together surer than either.
-        assert SHARED_MM / 2 < settled.sideways_mm < min(settled.open_mm, settled.shift.sigma_mm)
-        assert settled.remarks() == []
+        assert SHARED_MM / 2 < refined.lateral_sd_mm < min(refined.marker_sd_mm, refined.shift.sigma_mm)
+        assert refined.warnings() == []
     before, after = (float(np.median(m)) for m in zip(*((c.before_mm, c.after_mm) for c in cases), strict=True))
     assert before > LOOSE_MM
     assert 0.002 < after < 2 * SHARED_MM
@@ -128,11 +127,11 @@ def test_what_nothing_settles_is_said(caster: RayCaster, picture: Image) -> None
     flat = RayCaster(bump_mesh(height_mm=0.1))
     for image, surface, seed in [(blank, caster, 0), (blank, caster, 1), (seen(flat.mesh), flat, 0)]:
         found = case(image, surface, ALL, 2 * BLURRED_PX, seed)
-        assert [code for code, _ in found.settled.remarks()] == ["cube_camera_loose"]
-        assert not found.settled.by_specimen
-        assert found.settled.shift is None
-        assert found.settled.sideways_mm >= found.settled.open_mm > LOOSE_MM
-        assert f"{found.settled.sideways_mm:.1f} mm" in found.settled.remarks()[0][1]
+        assert [w.code for w in found.refined.warnings()] == ["cube_camera_loose"]
+        assert not found.refined.specimen_used
+        assert found.refined.shift is None
+        assert found.refined.lateral_sd_mm >= found.refined.marker_sd_mm > LOOSE_MM
+        assert f"{found.refined.lateral_sd_mm:.1f} mm" in found.refined.warnings()[0].message
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -141,20 +140,20 @@ def test_a_moved_specimen_does_not_draw_the_camera_along(caster: RayCaster, seed
     moved = float(np.hypot(*MOVED_MM[:2]))
     for noise_px in (SHARP_PX, BLURRED_PX):
         found = case(image, caster, ALL, noise_px, seed)
-        assert not found.settled.by_specimen
+        assert not found.refined.specimen_used
         assert found.after_mm == found.before_mm
         # A motion is no fault of the camera's.
-        loose = ["cube_camera_loose"] if found.settled.camera_mm > LOOSE_MM else []
-        assert [code for code, _ in found.settled.remarks()] == ["specimen_moved", *loose]
+        loose = ["cube_camera_loose"] if found.refined.camera_sd_mm > LOOSE_MM else []
+        assert [w.code for w in found.refined.warnings()] == ["specimen_moved", *loose]
         assert noise_px > SHARP_PX or not loose
         # What the camera itself is off by is part of what is seen of the motion.
-        assert found.settled.sideways_mm == pytest.approx(moved, abs=found.before_mm + SHARED_MM)
+        assert found.refined.lateral_sd_mm == pytest.approx(moved, abs=found.before_mm + SHARED_MM)
 
 
 # ---- whole runs ---------------------------------------------------------------------------------------
 
 
-def resolved(folder: Path) -> tuple[float, float, Settled]:
+def resolved(folder: Path) -> tuple[float, float, RefinedCamera]:
     """How far the specimen's true places show from their pixels, sideways, mm: by the run's markers alone, and settled
     as in its stage 4."""
     truth, stage2, cube = load_truth(folder), stage2_of(folder / "out"), open_cube(folder / "hsi" / "hsi.hdr")
@@ -162,7 +161,7 @@ def resolved(folder: Path) -> tuple[float, float, Settled]:
     found = find_markers(cube, "DICT_4X4_50", adjusted.marker_ids)
     corners = corners_in_cube(found, adjusted, cube.cols)
     alone = solve_camera(*corners.flat(), cube.rows, cube.cols)
-    settled = settle_camera(corners, found, cube.rows, cube.cols, RayCaster(stage2.mesh), adjusted.corners)
+    refined = refine_camera(corners, found, cube.rows, cube.cols, RayCaster(stage2.mesh), adjusted.corners)
     true_corners = truth.marker_corners[[list(truth.marker_ids).index(i) for i in adjusted.marker_ids]]
     _, R, t = fit_similarity(true_corners.reshape(-1, 3), adjusted.corners.reshape(-1, 3))
     pixels = np.argwhere(truth.hsi_class == CLASS_SPECIMEN)
@@ -172,7 +171,7 @@ def resolved(folder: Path) -> tuple[float, float, Settled]:
         miss = camera.view.project(places) - pixels[:, ::-1]
         return float(np.sqrt((miss**2).sum(1).mean())) * camera.pixel_mm
 
-    return off(alone), off(settled.camera), settled
+    return off(alone), off(refined.camera), refined
 
 
 def test_a_run_with_two_markers_in_the_cube_is_settled(finished: Finished, small: OnDisk, tmp_path: Path) -> None:
@@ -180,12 +179,12 @@ def test_a_run_with_two_markers_in_the_cube_is_settled(finished: Finished, small
     assert report.marker_ids_in_cube == [0, 2]
     assert "markers_missing_in_cube" in codes(report)
     assert not codes(report) & {"specimen_moved", "cube_camera_loose"}
-    before, after, settled = resolved(tmp_path)
-    assert settled.by_specimen
-    assert settled.open_mm > LOOSE_MM
-    assert settled.shift is not None
-    assert 0.003 < after < min(before, 3 * settled.shift.sigma_mm)
-    assert report.cube_camera.focal_px == pytest.approx(settled.camera.view.intrinsics.focal_px, rel=1e-3)
+    before, after, refined = resolved(tmp_path)
+    assert refined.specimen_used
+    assert refined.marker_sd_mm > LOOSE_MM
+    assert refined.shift is not None
+    assert 0.003 < after < min(before, 3 * refined.shift.sigma_mm)
+    assert report.cube_camera.focal_px == pytest.approx(refined.camera.view.intrinsics.focal_px, rel=1e-3)
     # Half the markers, and the places are about as good as with all of them.
     error, usual = judge_with_sigma(tmp_path / "out", tmp_path).errors, judge(finished.out, small.folder)
     assert 0.02 < error.median < 1.3 * usual.median
@@ -221,10 +220,10 @@ def test_a_run_on_blurred_photos_is_settled(blurred: tuple[Path, Report]) -> Non
     folder, report = blurred
     assert len(report.marker_ids_in_cube) == 3
     assert not codes(report) & {"specimen_moved", "cube_camera_loose"}
-    before, after, settled = resolved(folder)
-    assert settled.by_specimen
-    assert settled.shift is not None
+    before, after, refined = resolved(folder)
+    assert refined.specimen_used
+    assert refined.shift is not None
     # The specimen has more to say than the corners.
-    assert settled.open_mm > settled.shift.sigma_mm
-    assert 0.003 < after < min(before, 3 * settled.shift.sigma_mm)
-    assert 0.3 * after < settled.sideways_mm < LOOSE_MM
+    assert refined.marker_sd_mm > refined.shift.sigma_mm
+    assert 0.003 < after < min(before, 3 * refined.shift.sigma_mm)
+    assert 0.3 * after < refined.lateral_sd_mm < LOOSE_MM

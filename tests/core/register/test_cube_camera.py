@@ -50,14 +50,14 @@ def test_sideways_deviation_is_that_of_repeated_solutions(aside_mm: float, noise
     view, raised = above(1600.0, aside_mm), np.array([[0.0, 0.0, 10.0]])
     cameras = [solved(view, noise_px, seed) for seed in range(60)]
     off = np.array([(c.view.project(raised) - view.project(raised))[0] * c.pixel_mm for c in cameras])
-    stated = float(np.median([c.sideways_mm(raised) for c in cameras]))
+    stated = float(np.median([c.lateral_sd_mm(raised) for c in cameras]))
     # Sixty draws know a deviation to a tenth; the prior and soft weights make it a little wide.
     assert 0.6 < float(np.sqrt((off**2).sum(1).mean())) / stated < 1.3
 
 
 def test_from_above_markers_hold_their_plane_and_leave_height_open() -> None:
     camera = solved(above(1600.0, 10.0), SHARP_PX, 0)
-    in_plane, raised = camera.sideways_mm(CORNERS.reshape(-1, 3)), camera.sideways_mm(np.array([[0.0, 0.0, 10.0]]))
+    in_plane, raised = camera.lateral_sd_mm(CORNERS.reshape(-1, 3)), camera.lateral_sd_mm(np.array([[0.0, 0.0, 10.0]]))
     assert 0 < in_plane < 0.3 * raised
 
 
@@ -67,7 +67,7 @@ def test_an_anchor_holds_the_camera_where_it_is_known() -> None:
     gained = []
     for seed in SEEDS:
         free, held = solved(view, 0.2, seed), solved(view, 0.2, seed, anchor)
-        gained.append(held.sideways_mm(raised) / free.sideways_mm(raised))
+        gained.append(held.lateral_sd_mm(raised) / free.lateral_sd_mm(raised))
         away = float(np.linalg.norm(held.view.project(raised)[0] - anchor.pixel))
         assert 0 < away < 3 * anchor.sigma_px
     assert 0.01 < np.median(gained) < 0.5

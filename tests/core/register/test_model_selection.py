@@ -14,12 +14,12 @@ from specimap_core.errors import RegistrationError, SpecimapError
 from specimap_core.geometry.cameras import Intrinsics, View, look_at
 from specimap_core.geometry.pushbroom import Axis, ScanView
 from specimap_core.register.accuracy import on_plane
-from specimap_core.register.camera_fitting import Sight, refit
+from specimap_core.register.camera_fitting import CubeObservations, refit
 from specimap_core.register.camera_models import FRAME
 from specimap_core.register.cube_camera import CubeCamera, solve_camera
-from specimap_core.register.model_selection import Choice, choose_camera
-from specimap_core.register.stripes import without_stripes
-from specimap_core.register.tile_offsets import Sighting
+from specimap_core.register.destriping import destriped
+from specimap_core.register.model_selection import SelectedCamera, select_camera
+from specimap_core.register.tile_offsets import TileOffsets
 from specimap_core.report.model import Report
 from specimap_core.truth.judge import Judged, judge_with_sigma
 from tests.support.moved_specimen import CORNERS, LARGER
@@ -32,25 +32,25 @@ NOTHING = np.empty((0, 3))
 RAISED = np.random.default_rng(1).uniform([-12, -12, 5], [12, 12, 12], (100, 3))
 
 
-def unseen(view: View) -> Sighting | None:
+def unseen(view: View) -> TileOffsets | None:
     """No specimen is found through any camera."""
     del view
     return None
 
 
-def square_camera(sight: Sight) -> CubeCamera | None:
+def square_camera(observed: CubeObservations) -> CubeCamera | None:
     try:
-        return solve_camera(sight.corners, sight.pixels, sight.sigma_px, ROWS, COLS)
+        return solve_camera(observed.corners, observed.pixels, observed.sigma_px, ROWS, COLS)
     except RegistrationError:
         return None
 
 
-def by_corners(view: View, noise_px: float, seed: int, ids: tuple[int, ...] = (0, 1, 2, 3)) -> Choice:
+def by_corners(view: View, noise_px: float, seed: int, ids: tuple[int, ...] = (0, 1, 2, 3)) -> SelectedCamera:
     """What corners with noise alone say of ``view``."""
     corners = CORNERS[list(ids)].reshape(-1, 3)
     pixels = view.project(corners) + np.random.default_rng(seed).normal(0, noise_px, (len(corners), 2))
-    sight = Sight(corners, pixels, np.full(len(corners), max(noise_px, SHARP_PX)))
-    return choose_camera(sight, ROWS, COLS, square_camera(sight), RAISED, unseen)
+    observed = CubeObservations(corners, pixels, np.full(len(corners), max(noise_px, SHARP_PX)))
+    return select_camera(observed, ROWS, COLS, square_camera(observed), RAISED, unseen)
 
 
 def above(aspect: float = 1.0, tilt_mm: float = 8.0) -> View:
@@ -75,10 +75,10 @@ def test_the_aspect_shows_in_the_corners(aspect: float, ids: tuple[int, ...]) ->
         assert choice.model is not FRAME
         camera = choice.fit.camera
         assert camera.view.intrinsics.aspect == pytest.approx(aspect, rel=0.01)
-        assert not choice.by_specimen
+        assert not choice.specimen_used
         # Kinds that the corners do not tell apart, and all tilts that they allow, are in what is stated.
         off = (camera.view.project(RAISED) - above(aspect).project(RAISED)) * camera.span_mm
-        stated = float(np.hypot(choice.alone.camera.sideways_mm(RAISED), choice.open_mm))
+        stated = float(np.hypot(choice.by_corners.camera.lateral_sd_mm(RAISED), choice.ambiguity_mm))
         assert stated > 0.005
         assert float(np.sqrt((off**2).sum(1).mean())) < 3 * stated
 
@@ -122,13 +122,13 @@ def test_whatever_the_corners_show_ends_in_a_camera_or_a_refusal(
     pixels = view.project(corners) + np.random.default_rng(0).normal(0, noise_px, (len(corners), 2))
     if mirrored:
         pixels[:, 0] = COLS - 1 - pixels[:, 0]
-    sight = Sight(corners, pixels, np.full(len(corners), SHARP_PX))
+    observed = CubeObservations(corners, pixels, np.full(len(corners), SHARP_PX))
     try:
-        choice = choose_camera(sight, ROWS, COLS, square_camera(sight), NOTHING, unseen)
+        choice = select_camera(observed, ROWS, COLS, square_camera(observed), NOTHING, unseen)
     except SpecimapError:
         return
     assert np.isfinite(choice.fit.camera.view.project(corners)).all()
-    assert np.isfinite([choice.open_mm, choice.unfit_mm, choice.fit.cost]).all()
+    assert np.isfinite([choice.ambiguity_mm, choice.misfit_mm, choice.fit.cost]).all()
 
 
 # ---- dead columns and lines ---------------------------------------------------------------------------
@@ -141,11 +141,11 @@ def test_dead_columns_and_lines_are_bridged_and_nothing_else(value: float) -> No
     smooth = 0.5 + 0.2 * np.sin(cols / 9) * np.cos(rows / 7)
     clean = (smooth + 0.01 * rng.standard_normal(rows.shape)).astype(np.float32)
     clean[20:60, 30:70] = 0.05
-    assert (without_stripes(clean) == clean).all()
+    assert (destriped(clean) == clean).all()
     dead = clean.copy()
     dead[:, [0, 80, 81, 82, 159]] = value
     dead[50:53] = value
-    bridged = without_stripes(dead)
+    bridged = destriped(dead)
     touched = np.zeros(clean.shape, bool)
     touched[:, [0, 80, 81, 82, 159]] = touched[50:53] = True
     assert np.abs(bridged - clean)[touched].max() < 0.6

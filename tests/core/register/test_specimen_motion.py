@@ -14,10 +14,10 @@ from specimap_core.pipeline.artefacts import Stage2
 from specimap_core.pipeline.outputs import Inputs
 from specimap_core.pipeline.run import run_pipeline
 from specimap_core.pipeline.settings import PipelineSettings
-from specimap_core.register.accuracy import CornersInCube
+from specimap_core.register.corners import CornersInCube
 from specimap_core.register.cube_camera import solve_camera
 from specimap_core.register.cube_markers import find_markers
-from specimap_core.register.specimen_motion import ALLOWED_MM, Shift, specimen_shift
+from specimap_core.register.specimen_motion import ALLOWED_MM, Shift, measure_motion
 from specimap_core.surface.raycast import RayCaster
 from specimap_validation.phantom import Phantom, PhantomSettings, write_cube
 from tests.support.moved_specimen import (
@@ -41,7 +41,7 @@ def shift_in(stage2: Stage2, cube: Cube) -> Shift | None:
     seen = CornersInCube(found.marker_ids, stage2.adjusted.corners[rows], found.corners_px, found.sigma_px)
     camera = solve_camera(*seen.flat(), cube.rows, cube.cols)
     corners = stage2.adjusted.corners
-    return specimen_shift(
+    return measure_motion(
         found.image,
         camera.view,
         RayCaster(stage2.mesh),
@@ -130,7 +130,7 @@ def test_an_image_brought_to_working_size_keeps_its_place(width: int) -> None:
     # No whole number of working pixels fits these widths; half of one is 0.1 mm at the far side.
     fine = View(Intrinsics.centred(width, 401, 2470.0), VIEW.cam_from_world)
     mesh = textured()
-    shift = specimen_shift(seen(mesh, view=fine), fine, RayCaster(mesh), CORNERS, markers_in_cube=4)
+    shift = measure_motion(seen(mesh, view=fine), fine, RayCaster(mesh), CORNERS, markers_in_cube=4)
     assert shift is not None
     assert 1e-5 < np.hypot(*shift.shift_mm) < 0.02
 
@@ -141,7 +141,7 @@ def test_direction_and_turn_are_those_of_the_marker_frame(x: float, y: float, de
     mesh = textured()
     image = seen(moved_by(mesh, turned(degrees, np.array([x, y, 0.0]))))
     image = np.ascontiguousarray(image[:, ::-1]) if mirrored else image
-    shift = specimen_shift(image, VIEW, RayCaster(mesh), CORNERS, markers_in_cube=4, mirrored=mirrored)
+    shift = measure_motion(image, VIEW, RayCaster(mesh), CORNERS, markers_in_cube=4, mirrored=mirrored)
     assert shift is not None
     # Half a working pixel.
     assert shift.shift_mm == pytest.approx((x, y), abs=0.1)
@@ -152,17 +152,17 @@ def test_direction_and_turn_are_those_of_the_marker_frame(x: float, y: float, de
 def test_nothing_is_said_where_nothing_can_be_told() -> None:
     rng = np.random.default_rng(1)
     caster, image = RayCaster(textured()), seen(textured())
-    assert specimen_shift(np.full(image.shape, 0.5, np.float32), VIEW, caster, CORNERS, markers_in_cube=4) is None
-    assert specimen_shift(np.full(image.shape, np.nan, np.float32), VIEW, caster, CORNERS, markers_in_cube=4) is None
+    assert measure_motion(np.full(image.shape, 0.5, np.float32), VIEW, caster, CORNERS, markers_in_cube=4) is None
+    assert measure_motion(np.full(image.shape, np.nan, np.float32), VIEW, caster, CORNERS, markers_in_cube=4) is None
     for _ in range(5):
         noise = rng.uniform(0, 1, image.shape).astype(np.float32)
-        assert specimen_shift(noise, VIEW, caster, CORNERS, markers_in_cube=4) is None
+        assert measure_motion(noise, VIEW, caster, CORNERS, markers_in_cube=4) is None
     flat = bump_mesh(height_mm=0.1)
-    assert specimen_shift(seen(flat), VIEW, RayCaster(flat), CORNERS, markers_in_cube=4) is None
+    assert measure_motion(seen(flat), VIEW, RayCaster(flat), CORNERS, markers_in_cube=4) is None
     # Another specimen altogether.
     other = replace(textured(), colours=rng.integers(20, 230, (len(textured().vertices), 3)).astype(np.uint8))
-    assert specimen_shift(seen(other), VIEW, caster, CORNERS, markers_in_cube=4) is None
+    assert measure_motion(seen(other), VIEW, caster, CORNERS, markers_in_cube=4) is None
     # Three markers leave the camera too loose.
     moved = seen(moved_by(textured(), turned(0.0, np.array([2.0, 0, 0]))))
-    assert specimen_shift(moved, VIEW, caster, CORNERS, markers_in_cube=4) is not None
-    assert specimen_shift(moved, VIEW, caster, CORNERS, markers_in_cube=3) is None
+    assert measure_motion(moved, VIEW, caster, CORNERS, markers_in_cube=4) is not None
+    assert measure_motion(moved, VIEW, caster, CORNERS, markers_in_cube=3) is None

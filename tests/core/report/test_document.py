@@ -15,9 +15,10 @@ import pytest
 from specimap_core.cloud import Cloud, CloudPoints
 from specimap_core.errors import CloudDamagedError, NotFoundError
 from specimap_core.export import export_cloud
+from specimap_core.notices import Notice
 from specimap_core.report.document import write_document
-from specimap_core.report.maps import cube_frame, from_above, spacing_mm
-from specimap_core.report.model import Refused, Remark, Report
+from specimap_core.report.maps import cube_frame, spacing_mm, top_raster
+from specimap_core.report.model import Refused, Report
 from tests.support.cloud_scene import scene
 from tests.support.document_scene import Page, folder_of, full_report
 
@@ -101,7 +102,7 @@ def test_hostile_names_are_text(tmp_path: Path) -> None:
     report = report.model_copy(
         update={
             "photos": report.photos.model_copy(update={"refused": refused, "given": 4}),
-            "warnings": [Remark(code="unheard_of", message=HOSTILE)],
+            "warnings": [Notice(code="unheard_of", message=HOSTILE)],
             "settings": {HOSTILE: HOSTILE},
         }
     )
@@ -236,7 +237,7 @@ def test_maps_hold_the_points_where_they_belong(folder: Path) -> None:
     assert np.isfinite(shown).sum() == cloud.n_points
     # The scene has 0.1 mm a pixel; float32 places give it to their own precision.
     assert abs(spacing_mm(cloud) - 0.1) < 1e-5
-    above = from_above(cloud)
+    above = top_raster(cloud)
     known = np.isfinite(above.height_mm)
     assert known.mean() > 0.8
     assert above.height_mm[known].min() >= cloud.xyz[:, 2].min() - 1e-5

@@ -13,10 +13,10 @@ import pytest
 from specimap_core.errors import RegistrationError, ResultInsufficientError
 from specimap_core.geometry.cameras import look_at
 from specimap_core.reconstruct.backend import CornersInPhotos
-from specimap_core.reconstruct.pose_check import strays
+from specimap_core.reconstruct.pose_check import outlier_photos
 from specimap_core.report.model import PhotoCorners, Report
 from specimap_core.report.quality_gates import gated, outlying_photos
-from specimap_core.report.wording import GRAVE, REMARKS, checks, verdict
+from specimap_core.report.wording import GRAVE, WARNING_ADVICE, checks, verdict
 from tests.support.broken_sets import card_moved, copied, sheared
 from tests.support.document_scene import full_report, square
 from tests.support.scenes import EDGE_MM, SMALL, Finished, OnDisk, marker_scene, phantom_on_disk, run_refused, specimap
@@ -77,7 +77,7 @@ def test_each_figure_beyond_its_limit_is_said_twice(changes: dict[str, Any], cod
     said = verdict(found)
     assert said.level == "attention"
     assert said.actions
-    assert REMARKS[code]
+    assert WARNING_ADVICE[code]
     failed = [c for c in checks(found) if not c.good]
     assert failed or code in GRAVE
 
@@ -146,12 +146,12 @@ def test_photos_tens_of_pixels_off_are_strays(moved: dict[int, float]) -> None:
     for k, mm in moved.items():
         aside = np.array([mm, 0.0, 0.0])
         poses[k] = look_at(poses[k].centre + aside, aside, np.array([0.0, 0, 1]))
-    found = strays(truth.lens, poses, CornersInPhotos(seen, (0, 1, 2, 3)))
+    found = outlier_photos(truth.lens, poses, CornersInPhotos(seen, (0, 1, 2, 3)))
     assert set(found) == set(moved)
     assert all(20 < px < 400 for px in found.values())
     # Photos that show no marker are not judged.
     blind = CornersInPhotos(seen.of(~np.isin(seen.photo, list(moved))), (0, 1, 2, 3))
-    assert strays(truth.lens, poses, blind) == {}
+    assert outlier_photos(truth.lens, poses, blind) == {}
 
 
 # ---- whole runs -----------------------------------------------------------------------------------------

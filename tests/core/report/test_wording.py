@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-import re
-
 import pytest
 
-from specimap_core.report.model import Refused, Remark, SigmaFigures
-from specimap_core.report.wording import REFUSALS, REMARKS, checks, placed, verdict
+from specimap_core.notices import Notice
+from specimap_core.report.model import Refused, SigmaFigures
+from specimap_core.report.wording import REFUSAL_ADVICE, checks, placement_sentence, verdict
 from tests.support.document_scene import full_report
-from tests.support.places import DOCS
+from tests.support.error_tables import table_of
 
 
-def table_of(heading: str) -> set[str]:
-    """Codes in the first column of a table of docs/errors.md."""
-    text = (DOCS / "errors.md").read_text(encoding="utf-8").split(f"## {heading}\n")[1].split("\n## ")[0]
-    cells = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
-    return {code for cell in cells for code in re.findall(r"`([a-z0-9_]+)`", cell)}
-
-
-def test_every_documented_code_has_its_advice() -> None:
-    assert table_of("Photos that are not used") <= set(REFUSALS)
-    assert len(table_of("Warnings")) > 15
-    assert table_of("Warnings") <= set(REMARKS)
+def test_every_documented_refusal_has_its_advice() -> None:
+    assert table_of("Photos that are not used") <= set(REFUSAL_ADVICE)
 
 
 def test_verdicts() -> None:
@@ -30,7 +20,7 @@ def test_verdicts() -> None:
     said = verdict(report)
     assert (said.level, said.actions) == ("good", ())
     assert "All 3 photos were used." in said.sentences
-    warned = report.model_copy(update={"warnings": [Remark(code="few_photos", message="Few.")]})
+    warned = report.model_copy(update={"warnings": [Notice(code="few_photos", message="Few.")]})
     assert verdict(warned).level == "note"
     assert "with the warnings below" in verdict(warned).title
 
@@ -59,4 +49,4 @@ def test_verdicts() -> None:
 )
 def test_how_places_are_put_in_words(median: float, said: str) -> None:
     report = full_report(10).model_copy(update={"sigma_mm": SigmaFigures(median=median, p95=2 * median)})
-    assert said in placed(report)
+    assert said in placement_sentence(report)

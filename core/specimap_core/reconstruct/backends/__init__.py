@@ -1,1 +1,1 @@
-"""Backends beside the pairs of photos, and what they share: weights files, and what is there of them."""
+"""The reconstruction backends, and what they share: weights files, settings, alignment to the markers."""

@@ -33,7 +33,7 @@ class ColmapBackend:
         """See :class:`specimap_core.reconstruct.backend.ReconstructionBackend`."""
         posed = pose_photos(photos, corners, settings, workers=workers, progress=lambda share: progress(0.15 * share))
         progress(0.15)
-        maps, remarks = measure_depth(
+        maps, warnings = measure_depth(
             [photos[p].image for p in posed.photos],
             posed.lens,
             posed.poses,
@@ -49,5 +49,5 @@ class ColmapBackend:
             tuple(maps),
             sparse_points(maps, posed.poses),
             posed.refused,
-            (*posed.remarks, *remarks),
+            (*posed.warnings, *warnings),
         )

@@ -28,12 +28,12 @@ LEAST_PLACES = 12
 LEAST_SHARE = 0.5
 LARGEST_SCATTER = 0.03
 """A view whose depth scatters more than this share about what is known is not used: 4.5 mm at 150 mm."""
-LEAST_TOLD = 0.5
+LEAST_EXPLAINED = 0.5
 """Nor is one that scatters more than this share of how the known depths differ: a flat guess would do as well."""
 SHIFT_GAIN = 0.8
 """A shift must bring the scatter below this share of what the scale alone leaves."""
 SHIFT_SPREAD = 0.05
-"""Known depths must differ by this share of their middle for a shift to be told from a scale."""
+"""Known depths must differ by this share of their middle for a shift to be distinguished from a scale."""
 ROUNDS = 20
 TUKEY = 4.685
 LEAST_SIGMA = 1e-4
@@ -102,7 +102,7 @@ def align(network: Floats, true: Floats, *, seed: int = 0) -> Alignment | None:
     flat = SIGMA_OF_MAD * float(np.median(np.abs(z / unit[1] - 1)))
     if a <= 0 or near.sum() < max(LEAST_PLACES, LEAST_SHARE * len(d)):
         return None
-    if scatter > min(LARGEST_SCATTER, LEAST_TOLD * flat):
+    if scatter > min(LARGEST_SCATTER, LEAST_EXPLAINED * flat):
         return None
     return Alignment(a, b, scatter, int(near.sum()), len(d))
 

@@ -141,8 +141,8 @@ def _missing(found: dict[str, Any], do: Callable[[list[str]], str]) -> list[Miss
         by_reason.setdefault(why, []).append(name)
     if not by_reason:
         return []
-    said = "; ".join(f"{', '.join(names)}: {why}" for why, names in by_reason.items())
-    return [Missing(said, do([name for names in by_reason.values() for name in names]))]
+    reasons = "; ".join(f"{', '.join(names)}: {why}" for why, names in by_reason.items())
+    return [Missing(reasons, do([name for names in by_reason.values() for name in names]))]
 
 
 def _usable(

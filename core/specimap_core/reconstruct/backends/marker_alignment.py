@@ -1,4 +1,4 @@
-"""From a network's own frame and scale into the marker frame: by the corners that its cameras see."""
+"""Bring a network's cameras from their own frame and scale into the marker frame, by the corners that they see."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MOST_FOREIGN = 0.25
 
 
 @dataclass(frozen=True)
-class Placed:
+class AlignedCameras:
     """``scale``: what the network's lengths were multiplied by to give mm. ``poses``: ``cam_from_world`` of all photos
     in the marker frame, mm; ``corners`` (Q, 4, 3) mm of the markers that two photos show; ``foreign``: photos that show
     the markers as no camera would, with their misfit in pixels. ``resected``: photos whose own pose the markers
@@ -33,9 +33,9 @@ class Placed:
     resected: frozenset[int]
 
 
-def place_by_markers(
+def align_to_markers(
     lens: Intrinsics, poses: tuple[Pose, ...], corners: CornersInPhotos, names: list[str], edge_mm: float
-) -> Placed:
+) -> AlignedCameras:
     """Place cameras of any frame and scale; ``poses`` and ``names`` of all photos, in their order.
 
     A pose that the markers contradict is solved from the markers.
@@ -72,7 +72,7 @@ def place_by_markers(
     frame = marker_frame(scale * first, np.stack([p.centre for p in scaled]))
     back = frame.inverse()
     resected = frozenset(strange - set(foreign))
-    return Placed(scale, tuple(p @ back for p in scaled), frame.apply(scale * first), foreign, resected)
+    return AlignedCameras(scale, tuple(p @ back for p in scaled), frame.apply(scale * first), foreign, resected)
 
 
 def _resected(

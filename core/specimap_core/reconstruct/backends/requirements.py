@@ -1,4 +1,4 @@
-"""What a run asks for and this machine lacks, told before any work."""
+"""Check before any work that this machine has what a run asks for."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ def check_backend(name: str, backends: BackendSettings) -> None:
         return
     chosen, _ = found
     python = chosen.python or sys.executable
-    told = probe(python, chosen.modules)
-    if "failed" in told:
+    answer = probe(python, chosen.modules)
+    if "failed" in answer:
         raise BackendUnavailableError(
-            f"The interpreter of {name}, {python}, does not answer: {told['failed']}.",
+            f"The interpreter of {name}, {python}, does not answer: {answer['failed']}.",
             advice=f"Name one that does in SPECIMAP_{name.upper()}_PYTHON, or unset it.",
             python=python,
         )
-    missing = told.get("missing", {})
+    missing = answer.get("missing", {})
     if missing:
         module, why = next(iter(missing.items()))
         raise BackendUnavailableError(

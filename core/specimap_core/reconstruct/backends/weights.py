@@ -1,4 +1,4 @@
-"""Weights files: given by path, told apart by their sha256, held to the one that the user pins."""
+"""Weights files: given by path, identified by their sha256, checked against the one that the user pins."""
 
 from __future__ import annotations
 

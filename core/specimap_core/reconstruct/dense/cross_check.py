@@ -1,4 +1,4 @@
-"""How far the depth maps of different photos confirm each other."""
+"""Cross-check depth maps of different photos."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SEEN_BEHIND = 4.0
 """A depth this many tolerances behind the other photo's is hidden there: that photo has no say."""
 
 
-def sights(poses: Sequence[Pose], target: Floats) -> Floats:
+def viewing_directions(poses: Sequence[Pose], target: Floats) -> Floats:
     """Unit directions (N, 3) from ``target`` to the cameras."""
     away = np.stack([p.centre for p in poses]) - target
     return np.asarray(away / np.linalg.norm(away, axis=1, keepdims=True))
@@ -24,7 +24,7 @@ def sights(poses: Sequence[Pose], target: Floats) -> Floats:
 
 def nearest_photos(poses: Sequence[Pose], target: Floats, count: int) -> list[list[int]]:
     """For each photo the ``count`` others that look at ``target`` from the nearest directions."""
-    towards = sights(poses, target)
+    towards = viewing_directions(poses, target)
     order = np.argsort(-(towards @ towards.T), axis=1)
     return [[int(j) for j in row if j != i][:count] for i, row in enumerate(order)]
 
@@ -46,7 +46,7 @@ def confirmed(
 
 
 def share_confirmed(seen: Bytes, agreed: Bytes) -> Floats:
-    """The share, above 0 and up to 1, of those who see a depth that confirm it; 1 where none sees it."""
+    """The share, above 0 and up to 1, of the photos seeing a depth that confirm it; 1 where none sees it."""
     return np.asarray((1.0 + agreed) / (1.0 + np.maximum(seen, agreed)))
 
 

@@ -14,7 +14,7 @@ from specimap_core.errors import DepthNotFoundError
 from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
 from specimap_core.reconstruct.dense.depth_map import Bytes, DepthMap, DepthSettings
 from specimap_core.reconstruct.dense.pairs import choose_pairs
-from specimap_core.reconstruct.dense.stereo import before_shrinking, match_pair, shared_share, sight_angles
+from specimap_core.reconstruct.dense.stereo import antialiased, match_pair, shared_share, viewing_angles_deg
 from specimap_core.reconstruct.dense.volume import Volume
 
 COARSE_PX = 256
@@ -104,7 +104,7 @@ def dense_depth(
         )
     content = find_content(images, lens, poses, volume, pairs, settings, workers)
     shrinkage = settings.shrinkage(lens)
-    images = [before_shrinking(image, shrinkage) for image in images]
+    images = [antialiased(image, shrinkage) for image in images]
     maps: list[DepthMap] = []
 
     def run(pair: tuple[int, int]) -> DepthMap | None:
@@ -141,7 +141,7 @@ def _not_found(
             advice="Take the photos from farther away, so that each shows most of the markers with the specimen.",
             **details,
         )
-    apart_of = sight_angles(poses, volume.centre)
+    apart_of = viewing_angles_deg(poses, volume.centre)
     apart_deg = float(np.median([apart_of[i, j] for i, j in pairs]))
     if apart_deg > widest_deg:
         return DepthNotFoundError(

@@ -1,4 +1,4 @@
-"""Which pairs of photos depth is measured in."""
+"""Choose the pairs of photos for dense stereo."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from specimap_core.geometry.cameras import Floats, Pose
 from specimap_core.reconstruct.dense.depth_map import DepthSettings
-from specimap_core.reconstruct.dense.stereo import sight_angles
+from specimap_core.reconstruct.dense.stereo import viewing_angles_deg
 
 
 def choose_pairs(poses: tuple[Pose, ...], target: Floats, settings: DepthSettings) -> list[tuple[int, int]]:
@@ -16,7 +16,7 @@ def choose_pairs(poses: tuple[Pose, ...], target: Floats, settings: DepthSetting
     wider ones are taken, since a steep match is better than a hole.
     """
     distance = np.linalg.norm(np.stack([p.centre for p in poses]) - target, axis=1)
-    angle = sight_angles(poses, target)
+    angle = viewing_angles_deg(poses, target)
     least, best, widest = settings.angle_deg
     pairs = []
     partners = settings.pairs_per_photo - (len(poses) >= settings.many_photos)

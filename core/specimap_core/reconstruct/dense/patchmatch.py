@@ -17,6 +17,7 @@ import pycolmap
 
 from specimap_core.errors import BackendFailedError, BackendUnavailableError, DepthNotFoundError
 from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, View
+from specimap_core.notices import Notice, Notices
 from specimap_core.reconstruct.dense.cross_check import confirmed, nearest_photos, share_confirmed
 from specimap_core.reconstruct.dense.depth_map import Bytes, DepthMap, DepthSettings, cropped_map
 from specimap_core.reconstruct.dense.device import DENSE_DEVICE
@@ -35,11 +36,9 @@ TOLERANCE = 0.005
 """Share of the depth by which two photos' depths may differ: about one pixel at 15 degrees between them."""
 DEPTH_MARGIN = 0.02
 
-REMARK = ("dense_on_gpu", "Depth was measured on a GPU by COLMAP's PatchMatch.")
-FELL_BACK = "dense_gpu_failed"
+DENSE_ON_GPU = Notice("dense_on_gpu", "Depth was measured on a GPU by COLMAP's PatchMatch.")
 
 Progress = Callable[[float], None]
-Remarks = tuple[tuple[str, str], ...]
 
 
 def cuda_devices() -> int:
@@ -88,8 +87,8 @@ def measure_depth(
     *,
     workers: int,
     progress: Progress,
-) -> tuple[list[DepthMap], Remarks]:
-    """Depth maps on the device that the settings name, and (code, sentence) of what the report should say.
+) -> tuple[list[DepthMap], Notices]:
+    """Depth maps on the device that the settings name, and warnings for the report.
 
     ``auto`` takes a GPU where PatchMatch can run, and the CPU where it cannot or fails.
 
@@ -100,7 +99,7 @@ def measure_depth(
     missing = "" if settings.device == "cpu" else what_is_missing()
     if missing is not None:
         check_device(settings)
-    said: Remarks = ()
+    warnings: Notices = ()
     reached = 0.0
 
     def forward(share: float) -> None:
@@ -114,10 +113,12 @@ def measure_depth(
         except (BackendFailedError, DepthNotFoundError) as error:
             if settings.device == "gpu":
                 raise
-            said = ((FELL_BACK, f"Depth was measured on the CPU, since the GPU failed: {error.message}"),)
+            warnings = (
+                Notice("dense_gpu_failed", f"Depth was measured on the CPU, since the GPU failed: {error.message}"),
+            )
         else:
-            return maps, (REMARK,)
-    return dense_depth(images, lens, poses, volume, settings, workers=workers, progress=forward), said
+            return maps, (DENSE_ON_GPU,)
+    return dense_depth(images, lens, poses, volume, settings, workers=workers, progress=forward), warnings
 
 
 def patchmatch_depth(

@@ -20,11 +20,11 @@ MOST_DISPARITIES = 512
 OWN_BLUR_PX = 0.5
 NEAREST_SHARE = 0.05
 """Of the farthest depth: what is nearer, or behind, a camera does not see sharply."""
-LEAST_SHOWN = 4
+LEAST_IN_VIEW = 4
 """Points of a box that two photos must share."""
 
 
-def before_shrinking(image: Bytes, factor: float) -> Bytes:
+def antialiased(image: Bytes, factor: float) -> Bytes:
     """The image (H, W, 3) without what it could not hold at ``factor`` of its size, which would alias."""
     if factor >= 1:
         return image
@@ -32,7 +32,7 @@ def before_shrinking(image: Bytes, factor: float) -> Bytes:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), OWN_BLUR_PX * float(np.sqrt(1 / factor**2 - 1))), np.uint8)
 
 
-def sight_angles(poses: tuple[Pose, ...], target: Floats) -> Floats:
+def viewing_angles_deg(poses: tuple[Pose, ...], target: Floats) -> Floats:
     """Degrees (P, P) between the directions from which photos look at ``target`` (3,)."""
     sight = np.stack([p.centre for p in poses]) - target
     sight = sight / np.linalg.norm(sight, axis=1)[:, None]
@@ -49,7 +49,7 @@ class _Rectified:
     range_px: tuple[int, int]
 
 
-def _shown(points: Floats, lens: Intrinsics, pose: Pose) -> NDArray[np.bool_]:
+def _in_view(points: Floats, lens: Intrinsics, pose: Pose) -> NDArray[np.bool_]:
     """Which points (N, 3) lie before a camera and in its picture, distortion aside."""
     cam = pose.apply(points)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -77,11 +77,11 @@ def _rectify(lens: Intrinsics, first: Pose, second: Pose, content: Floats, shrin
     if cam[:, 2].min() <= NEAREST_SHARE * cam[:, 2].max():
         # A camera among the content: what it can see of the content's box, as near as disparities go.
         box = lattice_over(content.min(0), content.max(0))
-        cam = (box[_shown(box, lens, first) & _shown(box, lens, second)] - first.centre) @ R.T
+        cam = (box[_in_view(box, lens, first) & _in_view(box, lens, second)] - first.centre) @ R.T
         farthest = float(cam[:, 2].max(initial=0))
         nearest = focal_px * length / (MOST_DISPARITIES - 32 + focal_px * length / max(farthest, 1e-9))
         cam = cam[cam[:, 2] > max(nearest, NEAREST_SHARE * farthest)]
-    if len(cam) < LEAST_SHOWN:
+    if len(cam) < LEAST_IN_VIEW:
         return None
     pixels = focal_px * cam[:, :2] / cam[:, 2:]
     most = 1.3 * shrinkage * np.array([lens.width, lens.height])
@@ -110,8 +110,8 @@ def _warp(image: Bytes, lens: Intrinsics, turn: Floats, virtual: Intrinsics, shi
 
 def shared_share(lens: Intrinsics, first: Pose, second: Pose, content: Floats) -> float:
     """Share of ``content`` (N, 3) that a second photo shows, of what the first one does."""
-    seen = _shown(content, lens, first)
-    return float((_shown(content, lens, second) & seen).sum() / max(int(seen.sum()), 1))
+    seen = _in_view(content, lens, first)
+    return float((_in_view(content, lens, second) & seen).sum() / max(int(seen.sum()), 1))
 
 
 def match_pair(

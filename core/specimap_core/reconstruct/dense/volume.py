@@ -56,7 +56,7 @@ def volume_over(
     corners: Floats, poses: Sequence[Pose] = (), *, height_share: float = 0.35, below_mm: float = 2.0
 ) -> Volume:
     """The box over the markers' corners (Q, 4, 3), as high as ``height_share`` of the layout's diagonal, but no higher
-    than the cameras mostly are: over a wide layout a phone may hang lower than that.
+    than the cameras mostly are: over a wide layout a phone may be held lower than that.
 
     It reaches a third of a marker's edge beyond the corners, so that whole cards lie in it.
     """

@@ -47,7 +47,7 @@ def _package() -> Any:
 def _networks() -> tuple[Any, Any]:
     """Extractor and matcher with their weights.
 
-    torch reads weights as tensors alone, never as objects, unless told otherwise; the version that began with that
+    torch reads weights as tensors alone, never as objects, by default; the version that began with that
     is the oldest allowed.
     """
     try:

@@ -1,4 +1,4 @@
-"""What every kind of feature offers."""
+"""The interface of all kinds of image features."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which kind of feature a run takes, and whether it is installed."""
+"""Choose the kind of image feature, and check that it is installed."""
 
 from __future__ import annotations
 

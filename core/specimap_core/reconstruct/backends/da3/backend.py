@@ -10,6 +10,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from specimap_core.errors import BackendFailedError, DepthNotFoundError
 from specimap_core.geometry.cameras import Array, Floats, View
+from specimap_core.notices import Notice
 from specimap_core.photos.reading import Photo
 from specimap_core.reconstruct.backend import (
     CornersInPhotos,
@@ -20,10 +21,10 @@ from specimap_core.reconstruct.backend import (
 )
 from specimap_core.reconstruct.backends.da3.known_depths import placed_features
 from specimap_core.reconstruct.backends.da3.prepare import conditioning, plan_preparation, windows
-from specimap_core.reconstruct.backends.da3.residual_field import bend
+from specimap_core.reconstruct.backends.da3.residual_field import correct_residuals
 from specimap_core.reconstruct.backends.da3.settings import NAME, PREFIX, Da3Settings
 from specimap_core.reconstruct.backends.depth_alignment import LARGEST_SCATTER, align, depths_at, on_markers
-from specimap_core.reconstruct.backends.warnings import left_out, ran
+from specimap_core.reconstruct.backends.network_warnings import backend_run, depth_unaligned
 from specimap_core.reconstruct.dense.cross_check import confirmed, nearest_photos, share_confirmed
 from specimap_core.reconstruct.dense.depth_map import Bytes, DepthMap, cropped_map
 from specimap_core.reconstruct.dense.volume import Singles, Volume, inside_volume, volume_over
@@ -38,7 +39,9 @@ CONFIRMING = 4
 TOLERANCE = 0.01
 """Share of the depth by which views may differ and still confirm each other; more where they scatter more."""
 
-LICENCE = ("licence_apache", "Depth Anything 3's code and its SMALL and BASE weights are under the Apache licence 2.0.")
+LICENCE = Notice(
+    "licence_apache", "Depth Anything 3's code and its SMALL and BASE weights are under the Apache licence 2.0."
+)
 
 
 class Da3Backend:
@@ -102,9 +105,9 @@ class Da3Backend:
             metric.append(in_millimetres(points, view, depth, settings.seed))
         progress(0.95)
         maps = maps_of(images, views, metric, volume, workers)
-        remarks = (
+        warnings = (
             LICENCE,
-            ran(f"Depth Anything 3, {answer.facts['variant']},", answer.facts, weights),
+            backend_run(f"Depth Anything 3, {answer.facts['variant']},", answer.facts, weights),
             *_unaligned(shown, metric),
         )
         progress(1.0)
@@ -115,7 +118,7 @@ class Da3Backend:
             tuple(maps),
             sparse_points(maps, posed.poses),
             posed.refused,
-            (*posed.remarks, *remarks),
+            (*posed.warnings, *warnings),
         )
 
     def _infer(
@@ -161,12 +164,12 @@ def in_millimetres(points: Floats, view: View, network: Singles, seed: int) -> M
     fit = align(found, true, seed=seed)
     if fit is None:
         return None
-    depth, scatter = bend(fit.apply(network), at, true)
+    depth, scatter = correct_residuals(fit.apply(network), at, true)
     return Metric(depth, scatter) if np.isfinite(scatter) else None
 
 
-def _unaligned(photos: list[Photo], metric: list[Metric | None]) -> list[tuple[str, str]]:
-    """The remark on views without a scale.
+def _unaligned(photos: list[Photo], metric: list[Metric | None]) -> list[Notice]:
+    """The warning about views without a scale.
 
     Raises:
         DepthNotFoundError: none has one.
@@ -178,7 +181,7 @@ def _unaligned(photos: list[Photo], metric: list[Metric | None]) -> list[tuple[s
             advice="Use the default backend, or weights that fit the code of Depth Anything 3.",
             photos=left,
         )
-    return left_out("Depth Anything 3", "markers and features", left, len(photos))
+    return depth_unaligned("Depth Anything 3", "markers and features", left, len(photos))
 
 
 def smooth_surface(depth: Singles, view: View) -> Singles:

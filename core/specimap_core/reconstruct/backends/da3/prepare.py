@@ -10,9 +10,9 @@ import numpy as np
 
 from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
 from specimap_core.reconstruct.backends.da3.settings import PATCH_PX
-from specimap_core.reconstruct.dense.cross_check import sights
+from specimap_core.reconstruct.dense.cross_check import viewing_directions
 from specimap_core.reconstruct.dense.depth_map import Bytes
-from specimap_core.reconstruct.dense.stereo import before_shrinking
+from specimap_core.reconstruct.dense.stereo import antialiased
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Preparation:
         maps = cv2.initUndistortRectifyMap(
             self.lens.matrix, self.lens.distortion, np.eye(3), self.intrinsics.matrix, self.size, cv2.CV_32FC1
         )
-        image = before_shrinking(image, self.scale)
+        image = antialiased(image, self.scale)
         return np.asarray(cv2.remap(image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
@@ -65,7 +65,7 @@ def plan_preparation(lens: Intrinsics, longer_px: int) -> Preparation:
 
 def windows(poses: tuple[Pose, ...], target: Floats, most: int) -> list[list[int]]:
     """Photos in groups of ``most`` at most, each of neighbours around ``target``, all about as large."""
-    towards = sights(poses, target)
+    towards = viewing_directions(poses, target)
     order = np.argsort(np.arctan2(towards[:, 1], towards[:, 0]), kind="stable")
     return [[int(k) for k in part] for part in np.array_split(order, -(-len(poses) // most))]
 

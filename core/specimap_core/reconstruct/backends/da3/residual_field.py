@@ -1,4 +1,4 @@
-"""What known places tell of a network's aligned depth beyond its scale: an error that changes slowly."""
+"""Correct a network's aligned depth by a smooth field of its residuals at known places."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DOUBT = 3.0
 """As many places as this that show no error are added everywhere."""
 
 
-def bend(depth: Singles, at: Floats, true: Floats) -> tuple[Singles, float]:
+def correct_residuals(depth: Singles, at: Floats, true: Floats) -> tuple[Singles, float]:
     """Aligned depth (H, W) mm drawn to true depths (N,) mm at pixels (N, 2), and the scatter that is left.
 
     A network's error changes slowly over the picture. Its share of the depth, as the known places show it, is averaged

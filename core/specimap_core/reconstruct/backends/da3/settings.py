@@ -26,7 +26,7 @@ VARIABLES = {
 PATCH_PX = 14
 WEIGHTS_FILE = "model.safetensors"
 MODULES = ("numpy", "torch", "safetensors", "einops", "omegaconf", "addict")
-"""What the network's process imports beside the network itself, and what the network imports."""
+"""What the network's process imports besides the network itself, and what the network imports."""
 SOURCE = "DA3-SMALL and DA3-BASE are published by depth-anything on Hugging Face, under Apache 2.0."
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from specimap_core.errors import TooFewPhotosError
 from specimap_core.geometry.cameras import Intrinsics, Pose
+from specimap_core.notices import Notice
 from specimap_core.photos.reading import Photo, Refusal
 from specimap_core.reconstruct.backend import (
     CornersInPhotos,
@@ -20,7 +21,7 @@ from specimap_core.reconstruct.backend import (
     ReconstructSettings,
     sparse_points,
 )
-from specimap_core.reconstruct.backends.marker_alignment import place_by_markers
+from specimap_core.reconstruct.backends.marker_alignment import align_to_markers
 from specimap_core.reconstruct.backends.mast3r.images import Preparation, plan_preparation
 from specimap_core.reconstruct.backends.mast3r.maps import depth_maps
 from specimap_core.reconstruct.backends.mast3r.metric import Predicted, as_predicted, hold_to_markers, network_lens
@@ -30,14 +31,14 @@ from specimap_core.reconstruct.backends.mast3r.settings import (
     check_home,
     weights_of,
 )
-from specimap_core.reconstruct.backends.warnings import left_out, ran
+from specimap_core.reconstruct.backends.network_warnings import backend_run, depth_unaligned
 from specimap_core.sandbox.process import Answer, run_child
 
 CHILD = Path(__file__).with_name("child.py")
 STEPS = {"load": 3.0, "pairs": 70.0, "views": 5.0, "coarse": 9.0, "fine": 11.0, "depth": 2.0}
 """The child's steps and about how the time falls on them, on a GPU with 20 photos."""
 LEAST_PHOTOS = 3
-LICENCE = (
+LICENCE = Notice(
     "licence_non_commercial",
     "MASt3R's code and weights are CC BY-NC-SA 4.0: non-commercial use only.",
 )
@@ -95,7 +96,7 @@ class Mast3rBackend:
         )
         lens, poses = cameras_of(answer, plan)
         predicted = predicted_by(answer)
-        placed = place_by_markers(lens, poses, corners, [p.name for p in photos], settings.edge_mm)
+        placed = align_to_markers(lens, poses, corners, [p.name for p in photos], settings.edge_mm)
         metric = (
             hold_to_markers(
                 lens, placed, corners, predicted, plan, chosen.confidence, edge_mm=settings.edge_mm, seed=settings.seed
@@ -124,7 +125,11 @@ class Mast3rBackend:
             maps,
             sparse_points(list(maps), kept),
             refused,
-            (LICENCE, ran("MASt3R", answer.facts, weights), *left_out("MASt3R", "the markers", without, len(used))),
+            (
+                LICENCE,
+                backend_run("MASt3R", answer.facts, weights),
+                *depth_unaligned("MASt3R", "the markers", without, len(used)),
+            ),
         )
 
 

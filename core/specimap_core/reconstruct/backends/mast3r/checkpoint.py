@@ -124,7 +124,7 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
             warnings.simplefilter("ignore")
             stored = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
-        # Of torch's text the reason alone is told: the rest advises to load the file unsafely.
+        # Only the reason is taken from torch's text: the rest advises to load the file unsafely.
         code = re.search(r"GLOBAL ([\w.]+)", str(error))
         if code:
             raise BackendUnavailableError(

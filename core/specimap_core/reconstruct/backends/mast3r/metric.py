@@ -18,7 +18,7 @@ from specimap_core.bundle_adjust.adjust import Adjusted, AdjustSettings, adjust
 from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, View, rotation_from_vector
 from specimap_core.reconstruct.backend import CornersInPhotos
 from specimap_core.reconstruct.backends.depth_alignment import Alignment, align, depths_at, on_markers
-from specimap_core.reconstruct.backends.marker_alignment import Placed
+from specimap_core.reconstruct.backends.marker_alignment import AlignedCameras
 from specimap_core.reconstruct.backends.mast3r.images import Preparation
 from specimap_core.reconstruct.dense.volume import Singles
 
@@ -46,7 +46,7 @@ class Metric:
     depths: tuple[Singles | None, ...]
 
 
-def as_predicted(lens: Intrinsics, placed: Placed, predicted: Predicted) -> Metric:
+def as_predicted(lens: Intrinsics, placed: AlignedCameras, predicted: Predicted) -> Metric:
     """Cameras and depths as they are, but for frame and scale: as published, stage 2 then adjusts the poses alone.
 
     A photo that the markers had to place keeps no depth.
@@ -60,7 +60,7 @@ def as_predicted(lens: Intrinsics, placed: Placed, predicted: Predicted) -> Metr
 
 def hold_to_markers(
     lens: Intrinsics,
-    placed: Placed,
+    placed: AlignedCameras,
     corners: CornersInPhotos,
     predicted: Predicted,
     plan: Preparation,
@@ -81,7 +81,7 @@ def hold_to_markers(
     seen = corners.seen.of(~strange)
     adjusted = adjust(lens, placed.poses, seen, corners.marker_ids, AdjustSettings("rigid", edge_mm))
     network = network_lens(adjusted.lens, plan)
-    sure = np.where(predicted.confidence > least_confidence, predicted.depth, np.float32(0))
+    confident = np.where(predicted.confidence > least_confidence, predicted.depth, np.float32(0))
     all_corners = _by_marker(adjusted, corners.marker_ids)
     fits: list[Alignment | None] = []
     for photo, pose in enumerate(adjusted.poses):
@@ -91,16 +91,16 @@ def hold_to_markers(
             continue
         points = on_markers(all_corners, seen, photo)
         points = points[np.isfinite(points).all(1)]
-        _, found, true = depths_at(points, View(network, pose), sure[photo])
+        _, found, true = depths_at(points, View(network, pose), confident[photo])
         fits.append(align(found, true, seed=seed))
     poses = list(adjusted.poses)
-    move = _moved(placed, predicted, sure, network, adjusted.poses, fits)
-    if move is not None:
+    affine = _affine_to_markers(placed, predicted, confident, network, adjusted.poses, fits)
+    if affine is not None:
         given_up = {*placed.foreign, *placed.resected}
         for photo in [p for p, fit in enumerate(fits) if fit is None and p not in given_up]:
             marked = bool((seen.photo == photo).any())
-            poses[photo], fits[photo] = _located(
-                photo, placed, predicted, sure, network, poses[photo], move, keep_pose=marked, seed=seed
+            poses[photo], fits[photo] = _pose_from_own_points(
+                photo, placed, predicted, confident, network, poses[photo], affine, keep_pose=marked, seed=seed
             )
     depths = tuple(fit.apply(depth) if fit else None for fit, depth in zip(fits, predicted.depth, strict=True))
     return Metric(adjusted.lens, tuple(poses), adjusted.corners, depths)
@@ -122,9 +122,9 @@ def _by_marker(adjusted: Adjusted, marker_ids: tuple[int, ...]) -> Floats:
     return found
 
 
-def _pixels(sure: Singles) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _pixels(confident: Singles) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows and columns of an even sample of the known depths."""
-    rows, cols = np.nonzero(sure)
+    rows, cols = np.nonzero(confident)
     step = max(1, len(rows) // POINTS_PER_PHOTO)
     return rows[::step], cols[::step]
 
@@ -134,10 +134,10 @@ def _world(lens: Intrinsics, pose: Pose, rows: NDArray[np.intp], cols: NDArray[n
     return pose.inverse().apply(cam)
 
 
-def _moved(
-    placed: Placed,
+def _affine_to_markers(
+    placed: AlignedCameras,
     predicted: Predicted,
-    sure: Singles,
+    confident: Singles,
     network: Intrinsics,
     poses: tuple[Pose, ...],
     fits: list[Alignment | None],
@@ -150,7 +150,7 @@ def _moved(
     for photo, fit in enumerate(fits):
         if fit is None or photo in placed.foreign:
             continue
-        rows, cols = _pixels(sure[photo])
+        rows, cols = _pixels(confident[photo])
         scaled = predicted.depth[photo] * np.float32(placed.scale)
         before.append(_world(predicted.lenses[photo], placed.poses[photo], rows, cols, scaled))
         after.append(_world(network, poses[photo], rows, cols, fit.apply(predicted.depth[photo])))
@@ -159,33 +159,33 @@ def _moved(
         return None
     rows4 = np.column_stack([x, np.ones(len(x))])
     weight = np.ones(len(x))
-    move: Floats = np.zeros((4, 3))
+    affine: Floats = np.zeros((4, 3))
     for _ in range(5):  # few rounds suffice: the outliers are background, far from the rest
-        move = np.asarray(np.linalg.lstsq(rows4 * weight[:, None], y * weight[:, None], rcond=None)[0], float)
-        off = np.linalg.norm(rows4 @ move - y, axis=1)
+        affine = np.asarray(np.linalg.lstsq(rows4 * weight[:, None], y * weight[:, None], rcond=None)[0], float)
+        off = np.linalg.norm(rows4 @ affine - y, axis=1)
         weight = np.sqrt(1 / (1 + (off / max(2 * float(np.median(off)), 1e-6)) ** 2))
-    return move
+    return affine
 
 
-def _located(
+def _pose_from_own_points(
     photo: int,
-    placed: Placed,
+    placed: AlignedCameras,
     predicted: Predicted,
-    sure: Singles,
+    confident: Singles,
     network: Intrinsics,
     pose: Pose,
-    move: Floats,
+    affine: Floats,
     *,
     keep_pose: bool,
     seed: int,
 ) -> tuple[Pose, Alignment | None]:
     """Pose and fit of a photo by its own points, moved as the others' moved."""
-    rows, cols = _pixels(sure[photo])
+    rows, cols = _pixels(confident[photo])
     if len(rows) < LEAST_POINTS:
         return pose, None
     scaled = predicted.depth[photo] * np.float32(placed.scale)
     points = _world(predicted.lenses[photo], placed.poses[photo], rows, cols, scaled)
-    points = np.column_stack([points, np.ones(len(points))]) @ move
+    points = np.column_stack([points, np.ones(len(points))]) @ affine
     if not keep_pose:
         start = cv2.Rodrigues(pose.R)[0], pose.t.reshape(3, 1).copy()
         good, rvec, tvec = cv2.solvePnP(

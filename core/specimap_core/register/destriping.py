@@ -1,4 +1,4 @@
-"""Dead and hot columns and lines of an image, which a detector's line or a lost exposure leaves."""
+"""Remove stripes from an image: dead and hot columns, and lines of a lost exposure."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from scipy.ndimage import median_filter
 from specimap_core.geometry.robust import SIGMA_OF_MAD
 
 WIDEST_PX = 9
-"""Widest stripe that is told from what the image shows."""
+"""Widest stripe that is distinguished from what the image shows."""
 UNLIKE = 3.0
 """A line is a stripe where most of it differs from its surroundings by so many usual differences, to one side."""
 MOST = 0.6
 """How much of it must: on phantoms no line differs so over more than 0.17 of its length, dead ones over all of it."""
 
 
-def without_stripes(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The image (rows, cols) with what lies on stripes interpolated from beside them."""
+def destriped(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The image (rows, cols) with what lies on stripes interpolated from their surroundings."""
     filled = _without_columns(np.asarray(image, np.float32))
     return np.ascontiguousarray(_without_columns(filled.T).T)
 
@@ -30,7 +30,7 @@ def _without_columns(image: NDArray[np.float32]) -> NDArray[np.float32]:
     middle = np.float32(np.median(image[finite])) if finite.any() else np.float32(0)
     known = np.where(finite, image, middle)
     off = known - median_filter(known, (1, 2 * WIDEST_PX + 1), mode="mirror")
-    # What is usual stands beside the place itself: a bright part of the scene varies more than a dark one.
+    # What is usual is measured around the place itself: a bright part of the scene varies more than a dark one.
     usual = SIGMA_OF_MAD * np.median(np.abs(off), axis=1, keepdims=True) + 1e-6 * (np.abs(middle) + 1e-6)
     share = np.maximum((off > UNLIKE * usual).mean(0), (off < -UNLIKE * usual).mean(0))
     bad = (share > MOST) | (~finite).all(0)

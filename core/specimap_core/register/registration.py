@@ -1,0 +1,111 @@
+"""Stage 4: register a cube to the surface, by its solved camera or by the published homography."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specimap_core.bundle_adjust.adjust import Adjusted
+from specimap_core.cloud import CloudPoints
+from specimap_core.cube import Cube
+from specimap_core.geometry.cameras import Floats
+from specimap_core.register.accuracy import camera_figures, homography_figures
+from specimap_core.register.camera_refinement import RefinedCamera, refine_camera
+from specimap_core.register.corners import corners_in_cube
+from specimap_core.register.cube_markers import CubeMarkers, find_markers, unmirrored
+from specimap_core.register.placement import (
+    Homography,
+    Method,
+    RegisterSettings,
+    fit_homography,
+    homography_xyz,
+    place_by_camera,
+    place_by_homography,
+)
+from specimap_core.register.points import cloud_points
+from specimap_core.render.orthographic import Grid
+from specimap_core.report.model import MethodFigures
+from specimap_core.surface.raycast import RayCaster
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What a cube is registered to: the ``adjusted`` cameras and corners, the mesh in ``caster`` with ``sigma_mm`` (V,)
+    of its vertices, and the ``coarse`` and ``fine`` grids of it."""
+
+    adjusted: Adjusted
+    sigma_mm: Floats
+    caster: RayCaster
+    coarse: Grid
+    fine: Grid
+
+
+@dataclass(frozen=True)
+class Registered:
+    """A registered cube: its ``points`` by ``method``, the ``markers`` found in it, its ``camera``, the ``homography``,
+    the ``figures`` of both methods, and ``parallax_mm`` (S,), how far apart the methods put each point, NaN where one
+    of them does not."""
+
+    method: Method
+    markers: CubeMarkers
+    camera: RefinedCamera
+    homography: Homography
+    figures: Mapping[str, MethodFigures]
+    points: CloudPoints
+    parallax_mm: NDArray[np.float32]
+
+
+def register_cube(
+    cube: Cube,
+    surface: Surface,
+    dictionary: str,
+    settings: RegisterSettings,
+    *,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Registered:
+    """Register a cube whose markers are of ``dictionary``.
+
+    Raises:
+        MarkersMissingInCubeError, DuplicateMarkersError: the cube's markers do not suffice.
+        RegistrationError: no camera, or no homography, fits them.
+    """
+    adjusted, caster, grids = surface.adjusted, surface.caster, (surface.coarse, surface.fine)
+    markers = find_markers(cube, dictionary, adjusted.marker_ids)
+    progress(0.25)
+    seen = corners_in_cube(markers, adjusted, cube.cols)
+    refined = refine_camera(seen, markers, cube.rows, cube.cols, caster, adjusted.corners)
+    camera, (corners, corners_px, _) = refined.camera, seen.flat()
+    homography = fit_homography(corners, corners_px, surface.coarse, settings.ransac_px)
+    by_camera = settings.method == "camera"
+    placement = (
+        place_by_camera(camera.view, caster, markers.mirrored)
+        if by_camera
+        else place_by_homography(homography, *grids, camera.view, caster, markers.mirrored)
+    )
+    pixels = unmirrored(placement.pixels[:, ::-1].astype(float), markers.mirrored, cube.cols)
+    by_other_method = (
+        homography_xyz(homography, *grids, pixels)
+        if by_camera
+        else caster.cast(camera.view.origins(pixels), camera.view.world_rays(pixels)).xyz
+    )
+    parallax_mm = np.linalg.norm(placement.xyz - by_other_method, axis=1).astype(np.float32)
+    progress(0.75)
+    points = cloud_points(
+        placement,
+        caster,
+        surface.sigma_mm.astype(np.float32),
+        adjusted.corners,
+        float(np.median(adjusted.sigma_corner_mm)),
+        refined.lateral_sd_mm,
+        camera.pixel_mm,
+        None if by_camera else parallax_mm,
+    )
+    progress(0.875)
+    figures = {
+        "camera": camera_figures(seen, camera.view, caster),
+        "homography": homography_figures(seen, *grids, settings.ransac_px),
+    }
+    return Registered(settings.method, markers, refined, homography, figures, points, parallax_mm)
