@@ -12,6 +12,8 @@ pytest_plugins = (
     "tests.support.scenes",
     "tests.support.service_scene",
     "tests.support.client_scene",
+    "tests.support.da3_scene",
+    "tests.support.secret_file",
 )
 
 TEST_DATA_VARIABLE = "SPECIMAP_TEST_DATA"

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from specimap_cli.app import app
 from specimap_core.bundle_adjust.solver import MarkerScene
 from specimap_core.cloud import Cloud
+from specimap_core.errors import StageFailedError
 from specimap_core.fiducials.observations import Observations, corners_of
 from specimap_core.geometry.cameras import Array, Floats, Intrinsics, Pose, look_at, rotation_from_vector
 from specimap_core.pipeline.outputs import Inputs
@@ -27,6 +28,8 @@ from specimap_validation.phantom import PhantomSettings, load_truth, write_cube,
 
 SMALL = PhantomSettings(photos=12, photo_size=384, cube_rows=128, cube_cols=160, bands=16, mesh_divisions=64)
 EDGE_MM = 6.8
+UNNAMED = {"internal_error", StageFailedError.code}
+"""Codes of failures that no check foresaw."""
 
 
 # ---- marker layouts without pictures ------------------------------------------------------------------
