@@ -9,6 +9,7 @@ import pytest
 
 pytest_plugins = (
     "tests.support.databases",
+    "tests.support.shared_folders",
     "tests.support.scenes",
     "tests.support.service_scene",
     "tests.support.client_scene",

@@ -129,7 +129,7 @@ def test_a_file_that_leads_elsewhere_tells_nothing(kind: str, relative: bool, tm
     place = f"../../../../elsewhere/{secret.name}" if relative else str(secret)
     data = HOSTILE[kind](place, tmp_path)
     name = "x.tif" if kind == "ome" else "x.h5"
-    with serving(tmp_path / "service") as service:
+    with serving(tmp_path / "service", own_judge=True) as service:
         assert not told_secret(uploaded(service, data, name))
 
 
@@ -139,7 +139,7 @@ def test_a_file_that_leads_elsewhere_tells_nothing(kind: str, relative: bool, tm
 def test_confinement_holds_alone_where_a_reader_would_follow(kind: str, sandbox: str, tmp_path: Path) -> None:
     secret = secrets_in(tmp_path / "elsewhere")[kind]
     data = HOSTILE[kind](str(secret), tmp_path)
-    with serving(tmp_path / "service", sandbox=sandbox) as service:
+    with serving(tmp_path / "service", sandbox=sandbox, own_judge=True) as service:
         judge: Judge = service.app.state.context.judge
         judge._command = (sys.executable, "-c", NAIVE, *judge._command[3:])
         file = uploaded(service, data, "x.tif" if kind == "ome" else "x.h5")
@@ -185,7 +185,7 @@ def test_other_formats_that_name_paths_write_and_tell_nothing(tmp_path: Path) ->
     with zipfile.ZipFile(out, "w") as archive:
         archive.writestr(link, str(secret))
     files["link.npz"] = out.getvalue()
-    with serving(tmp_path / "service") as service:
+    with serving(tmp_path / "service", own_judge=True) as service:
         for name, data in files.items():
             file = uploaded(service, data, name)
             assert not told_secret(file), name
@@ -213,7 +213,7 @@ def test_photos_that_are_not_what_they_seem_tell_nothing(tmp_path: Path) -> None
         "a.eps": f"%!PS-Adobe-3.0 EPSF-3.0\n({secret}) (r) file\n".encode(),
         "a.fpx": bytes.fromhex("d0cf11e0a1b11ae1") * 100,
     }
-    with serving(tmp_path / "service") as service:
+    with serving(tmp_path / "service", own_judge=True) as service:
         client = service.client(("upload", "read"))
         acquisition = new_acquisition(client)
         for name, data in files.items():

@@ -25,6 +25,7 @@ from specimap_core.report.model import Report
 from specimap_core.surface.fusion import Mesh, vertex_normals
 from specimap_core.truth.truth_file import Truth
 from specimap_validation.phantom import PhantomSettings, load_truth, write_cube, write_phantom
+from tests.support.shared_folders import SharedFolders
 
 SMALL = PhantomSettings(photos=12, photo_size=384, cube_rows=128, cube_cols=160, bands=16, mesh_divisions=64)
 EDGE_MM = 6.8
@@ -126,6 +127,12 @@ def phantom_on_disk(folder: Path, settings: PhantomSettings) -> OnDisk:
     return OnDisk(folder, write_phantom(settings, folder))
 
 
+def shared_phantom(shared: SharedFolders, settings: PhantomSettings) -> OnDisk:
+    """A phantom that is written once for all processes; nobody changes it."""
+    folder = shared.made("phantom", settings, lambda folder: write_phantom(settings, folder))
+    return OnDisk(folder, load_truth(folder))
+
+
 def cube_with(values: NDArray[np.uint16], like: OnDisk, folder: Path) -> Path:
     """Write an altered cube; returns its header."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -145,6 +152,15 @@ class Finished:
         """A copy to run into again: its stages 1 and 2 are taken over."""
         shutil.copytree(self.out, folder)
         return folder
+
+
+def shared_run(shared: SharedFolders, phantom: PhantomSettings, settings: PipelineSettings) -> Finished:
+    """A run on a phantom that is made once for all processes; copy it before running into it again."""
+    disk = shared_phantom(shared, phantom)
+    inputs = Inputs(disk.photos, disk.header)
+    folder = shared.made("run", (phantom, settings), lambda folder: run_pipeline(inputs, folder / "out", settings))
+    out = folder / "out"
+    return Finished(out, Report.model_validate_json((out / "report.json").read_text(encoding="utf-8")))
 
 
 def read_corners(out: Path) -> tuple[list[int], Floats]:
@@ -234,17 +250,15 @@ def as_array(values: object) -> Array:
 
 
 @pytest.fixture(scope="session")
-def small(tmp_path_factory: pytest.TempPathFactory) -> OnDisk:
-    """A small phantom, written once."""
-    return phantom_on_disk(tmp_path_factory.mktemp("small"), SMALL)
+def small(shared: SharedFolders) -> OnDisk:
+    """A small phantom."""
+    return shared_phantom(shared, SMALL)
 
 
 @pytest.fixture(scope="session")
-def finished(small: OnDisk, tmp_path_factory: pytest.TempPathFactory) -> Finished:
+def finished(shared: SharedFolders, small: OnDisk) -> Finished:
     """One whole run on the small phantom; copy it before running into it again."""
-    out = tmp_path_factory.mktemp("finished") / "out"
-    report = run_pipeline(Inputs(small.photos, small.header), out, PipelineSettings())
-    return Finished(out, report)
+    return shared_run(shared, SMALL, PipelineSettings())
 
 
 __all__ = ["Finished", "OnDisk", "finished", "load_truth", "small"]
