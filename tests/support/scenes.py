@@ -154,12 +154,11 @@ class Finished:
         return folder
 
 
-def shared_run(shared: SharedFolders, phantom: PhantomSettings, settings: PipelineSettings) -> Finished:
-    """A run on a phantom that is made once for all processes; copy it before running into it again."""
-    disk = shared_phantom(shared, phantom)
-    inputs = Inputs(disk.photos, disk.header)
-    folder = shared.made("run", (phantom, settings), lambda folder: run_pipeline(inputs, folder / "out", settings))
-    out = folder / "out"
+def shared_run(shared: SharedFolders, acquisition: Path) -> Finished:
+    """A run on a folder with ``rgb`` and ``hsi``, made once for all processes; copy it before running into it again."""
+    inputs = Inputs(acquisition / "rgb", acquisition / "hsi" / "hsi.hdr")
+    made = shared.made("run", acquisition, lambda folder: run_pipeline(inputs, folder / "out", PipelineSettings()))
+    out = made / "out"
     return Finished(out, Report.model_validate_json((out / "report.json").read_text(encoding="utf-8")))
 
 
@@ -258,7 +257,7 @@ def small(shared: SharedFolders) -> OnDisk:
 @pytest.fixture(scope="session")
 def finished(shared: SharedFolders, small: OnDisk) -> Finished:
     """One whole run on the small phantom; copy it before running into it again."""
-    return shared_run(shared, SMALL, PipelineSettings())
+    return shared_run(shared, small.folder)
 
 
 __all__ = ["Finished", "OnDisk", "finished", "load_truth", "small"]
