@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -127,9 +127,9 @@ def phantom_on_disk(folder: Path, settings: PhantomSettings) -> OnDisk:
     return OnDisk(folder, write_phantom(settings, folder))
 
 
-def shared_phantom(shared: SharedFolders, settings: PhantomSettings) -> OnDisk:
+def shared_phantom(shared_folders: SharedFolders, settings: PhantomSettings) -> OnDisk:
     """A phantom that is written once for all processes; nobody changes it."""
-    folder = shared.made("phantom", settings, lambda folder: write_phantom(settings, folder))
+    folder = shared_folders.made("phantom", settings, lambda folder: write_phantom(settings, folder))
     return OnDisk(folder, load_truth(folder))
 
 
@@ -154,10 +154,12 @@ class Finished:
         return folder
 
 
-def shared_run(shared: SharedFolders, acquisition: Path) -> Finished:
+def shared_run(shared_folders: SharedFolders, acquisition: Path) -> Finished:
     """A run on a folder with ``rgb`` and ``hsi``, made once for all processes; copy it before running into it again."""
     inputs = Inputs(acquisition / "rgb", acquisition / "hsi" / "hsi.hdr")
-    made = shared.made("run", acquisition, lambda folder: run_pipeline(inputs, folder / "out", PipelineSettings()))
+    made = shared_folders.made(
+        "run", acquisition, lambda folder: run_pipeline(inputs, folder / "out", PipelineSettings())
+    )
     out = made / "out"
     return Finished(out, Report.model_validate_json((out / "report.json").read_text(encoding="utf-8")))
 
@@ -249,15 +251,18 @@ def as_array(values: object) -> Array:
 
 
 @pytest.fixture(scope="session")
-def small(shared: SharedFolders) -> OnDisk:
+def small(shared_folders: SharedFolders) -> OnDisk:
     """A small phantom."""
-    return shared_phantom(shared, SMALL)
+    return shared_phantom(shared_folders, SMALL)
 
 
 @pytest.fixture(scope="session")
-def finished(shared: SharedFolders, small: OnDisk) -> Finished:
+def other(shared_folders: SharedFolders) -> OnDisk:
+    """Another specimen in another layout of markers with the same ids."""
+    return shared_phantom(shared_folders, replace(SMALL, seed=2, bands=4))
+
+
+@pytest.fixture(scope="session")
+def finished(shared_folders: SharedFolders, small: OnDisk) -> Finished:
     """One whole run on the small phantom; copy it before running into it again."""
-    return shared_run(shared, small.folder)
-
-
-__all__ = ["Finished", "OnDisk", "finished", "load_truth", "small"]
+    return shared_run(shared_folders, small.folder)

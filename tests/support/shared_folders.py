@@ -37,7 +37,7 @@ class SharedFolders:
 
 
 @pytest.fixture(scope="session")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> SharedFolders:
+def shared_folders(tmp_path_factory: pytest.TempPathFactory) -> SharedFolders:
     """Folders that all processes of this test run share."""
     own = tmp_path_factory.getbasetemp()
     # With xdist each process has a folder of its own in that of the run.

@@ -10,14 +10,15 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.support.scenes import SMALL, UNNAMED, Finished, OnDisk, cube_with, phantom_on_disk, specimap
+from tests.support.scenes import SMALL, UNNAMED, Finished, OnDisk, cube_with, shared_phantom, specimap
+from tests.support.shared_folders import SharedFolders
 
 
-@pytest.fixture(scope="module")
-def tiny(tmp_path_factory: pytest.TempPathFactory) -> OnDisk:
+@pytest.fixture(scope="session")
+def tiny(shared_folders: SharedFolders) -> OnDisk:
     """Eight small photos and a cube of few bands."""
     recipe = replace(SMALL, photos=8, photo_size=320, mesh_divisions=40, cube_rows=96, cube_cols=120, bands=6)
-    return phantom_on_disk(tmp_path_factory.mktemp("tiny"), recipe)
+    return shared_phantom(shared_folders, recipe)
 
 
 Picture = np.ndarray[tuple[int, ...], np.dtype[np.uint8]]

@@ -141,9 +141,9 @@ def test_the_published_forms_run_too(finished: Finished, small: OnDisk, tmp_path
 # ---- the full-size phantom ----------------------------------------------------------------------------
 
 
-def test_phantom_a_meets_its_targets(data_dir: Path, shared: SharedFolders) -> None:
+def test_phantom_a_meets_its_targets(data_dir: Path, shared_folders: SharedFolders) -> None:
     folder = data_dir / "phantom_a"
-    run = shared_run(shared, folder)
+    run = shared_run(shared_folders, folder)
     against = judged(run.out, load_truth(folder))
     assert 0.02 < against.median <= 0.12
     assert 0.05 < against.p95 <= 0.5

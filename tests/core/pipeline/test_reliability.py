@@ -36,9 +36,9 @@ ONE, TWO = 0.68, 0.95
 Shares = tuple[float, float]
 
 
-def shares_of(shared: SharedFolders, folder: Path) -> Shares:
+def shares_of(shared_folders: SharedFolders, folder: Path) -> Shares:
     """Shares of a run's errors, on an acquisition with truth, within one and two stated standard deviations."""
-    judged = judge_with_sigma(shared_run(shared, folder).out, folder)
+    judged = judge_with_sigma(shared_run(shared_folders, folder).out, folder)
     assert len(judged.sigma_mm) > 1000
     assert (judged.sigma_mm > 0).all()
     # A constant would tell nothing of one point against another.
@@ -47,9 +47,12 @@ def shares_of(shared: SharedFolders, folder: Path) -> Shares:
 
 
 @pytest.fixture(scope="module")
-def own(shared: SharedFolders) -> dict[str, Shares]:
+def own(shared_folders: SharedFolders) -> dict[str, Shares]:
     """Shares on the own phantoms."""
-    return {name: shares_of(shared, shared_phantom(shared, settings).folder) for name, settings in PHANTOMS.items()}
+    return {
+        name: shares_of(shared_folders, shared_phantom(shared_folders, settings).folder)
+        for name, settings in PHANTOMS.items()
+    }
 
 
 @pytest.mark.parametrize("name", PHANTOMS)
@@ -62,14 +65,14 @@ def test_stated_deviations_hold_on_average(own: dict[str, Shares]) -> None:
     assert_near((one, two), 0.06, 0.04)
 
 
-def test_stated_deviations_hold_on_path_traced_tissue(data_dir: Path, shared: SharedFolders) -> None:
-    assert_near(shares_of(shared, data_dir / "phantom_hard"), 0.06, 0.04)
+def test_stated_deviations_hold_on_path_traced_tissue(data_dir: Path, shared_folders: SharedFolders) -> None:
+    assert_near(shares_of(shared_folders, data_dir / "phantom_hard"), 0.06, 0.04)
 
 
 @pytest.fixture(scope="module")
-def setter(data_dir: Path, shared: SharedFolders) -> Shares:
+def setter(data_dir: Path, shared_folders: SharedFolders) -> Shares:
     """Shares on the path-traced phantom that has a part in setting sigma."""
-    return shares_of(shared, data_dir / "phantom_a")
+    return shares_of(shared_folders, data_dir / "phantom_a")
 
 
 def test_stated_deviations_are_not_too_small_where_they_were_set(setter: Shares) -> None:

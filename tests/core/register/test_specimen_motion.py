@@ -114,8 +114,8 @@ def test_defects_are_not_taken_for_motion(tmp_path: Path, change: dict[str, obje
 
 
 @pytest.mark.parametrize("name", ["phantom_a", "phantom_hard"])
-def test_path_traced_specimens_did_not_move(data_dir: Path, shared: SharedFolders, name: str) -> None:
-    run = shared_run(shared, data_dir / name)
+def test_path_traced_specimens_did_not_move(data_dir: Path, shared_folders: SharedFolders, name: str) -> None:
+    run = shared_run(shared_folders, data_dir / name)
     shift = shift_in(stage2_of(run.out), open_cube(data_dir / name / "hsi" / "hsi.hdr"))
     assert shift is not None
     assert not shift.significant
