@@ -4,7 +4,7 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup learned demo test lint bench bench-service check-images clean
+.PHONY: help setup learned demo test test-fast lint bench bench-service check-images clean
 
 PYTHON ?= python3
 VENV := .venv
@@ -18,7 +18,8 @@ help:
 	@echo "make setup   install the pinned versions into $(VENV)"
 	@echo "make learned add PyTorch and the learned features"
 	@echo "make demo    set up, then run samples/ through a service of its own into $(DEMO_OUT)"
-	@echo "make test    set up, with the learned features, then run the tests"
+	@echo "make test    set up, with the learned features, then run all tests"
+	@echo "make test-fast   the same without the tests marked slow"
 	@echo "make lint    formatting (ruff format .), ruff and mypy"
 	@echo "make bench   measure time, memory and accuracy of a run"
 	@echo "make bench-service   measure the service, compared with nginx where it is installed"
@@ -57,6 +58,9 @@ demo: setup
 # More processes than cores: many tests wait for servers, leases and clocks.
 test: setup learned
 	$(RUN)/python -m pytest -n $(TEST_PROCESSES) --dist worksteal
+
+test-fast: setup learned
+	$(RUN)/python -m pytest -n $(TEST_PROCESSES) --dist worksteal -m "not slow"
 
 lint: setup
 	$(RUN)/ruff format --check .

@@ -13,9 +13,12 @@ limit_blas_threads()
 
 pytest_plugins = (
     "tests.support.databases",
+    "tests.support.shared_folders",
     "tests.support.scenes",
     "tests.support.service_scene",
     "tests.support.client_scene",
+    "tests.support.da3_scene",
+    "tests.support.secret_file",
 )
 
 TEST_DATA_VARIABLE = "SPECIMAP_TEST_DATA"
@@ -28,3 +31,9 @@ def data_dir() -> Path:
     if not value:
         pytest.skip(f"{TEST_DATA_VARIABLE} is not set: the large test data are not on this machine")
     return Path(value)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the modules that have slow tests: a long test that starts last leaves the other processes idle."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)

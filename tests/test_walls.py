@@ -119,6 +119,17 @@ def test_no_module_imports_open3d() -> None:
     assert importers == set()
 
 
+def test_no_test_module_imports_another() -> None:
+    # What several need lies in tests/support: a test can be moved, split or run alone.
+    wrong = [
+        f"{path.relative_to(ROOT)} imports {name}"
+        for path in sorted((ROOT / "tests").rglob("*.py"))
+        for name in sorted(imported(path.read_text("utf-8")))
+        if name.startswith("tests.") and any(part.startswith("test_") for part in name.split("."))
+    ]
+    assert wrong == []
+
+
 def test_the_parser_of_imports_sees_them() -> None:
     source = "import a.b\nfrom specimap_core import cloud\ndef f():\n    from c.d import e\n"
     assert imported(source) == {"a.b", "specimap_core.cloud", "c.d.e"}

@@ -11,6 +11,9 @@ from types import ModuleType
 
 from specimap_core.errors import BackendUnavailableError
 
+ATTEMPTS = 10
+"""At importing Open3D while other threads import."""
+
 
 def open3d() -> ModuleType:
     """Open3D, with the system library libusb brought by the package ``libusb-package`` where it is absent.
@@ -31,8 +34,8 @@ def open3d() -> ModuleType:
                     advice="Install it: sudo apt-get install libusb-1.0-0",
                 ) from error
     try:
-        return importlib.import_module("open3d")
-    except (ImportError, OSError) as error:
+        return _import_open3d()
+    except (ImportError, OSError, RuntimeError) as error:
         raise BackendUnavailableError(
             f"Open3D does not load: {error}.",
             advice="Install the system libraries it wants: "
@@ -44,6 +47,15 @@ def quiet_colmap() -> None:
     """Keep COLMAP's notes off standard error in this process: it reports every extractor it makes, and every step."""
     pycolmap = importlib.import_module("pycolmap")
     pycolmap.logging.minloglevel = pycolmap.logging.WARNING
+
+
+def _import_open3d() -> ModuleType:
+    for _ in range(ATTEMPTS - 1):
+        # Its import loops over sys.modules, and fails where another thread imports a module meanwhile. What it has
+        # loaded stays: a repeat takes milliseconds.
+        with suppress(RuntimeError):
+            return importlib.import_module("open3d")
+    return importlib.import_module("open3d")
 
 
 def preload() -> None:

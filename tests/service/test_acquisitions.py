@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import hashlib
 from pathlib import Path
+from typing import Any
 
 import pytest
 import sqlalchemy as sa
@@ -250,7 +251,7 @@ def test_forms_that_are_none(service: Running, body: bytes) -> None:
 
 
 def test_forms_within_limits(tmp_path: Path) -> None:
-    limits = {"max_photo_bytes": 200_000, "max_cube_bytes": 500_000, "max_photos": 2}
+    limits: dict[str, Any] = {"max_photo_bytes": 200_000, "max_cube_bytes": 500_000, "max_photos": 2}
     with serving(tmp_path, **limits) as service:
         client = service.client(quota_bytes=600_000)
         acquisition = new_acquisition(client)

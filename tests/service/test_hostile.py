@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
-import signal
 import struct
 import sys
 import zipfile
@@ -20,12 +18,9 @@ import pytest
 import tifffile
 
 from specimap_core.sandbox import protection
-from specimap_infra.settings import load_settings
 from specimap_service.acquisitions.judge import Judge
-from specimap_service.acquisitions.verdicts import LONGEST_TEXT, MOST_ITEMS, checked_verdict
 from tests.support.service_scene import Running, serving
 from tests.support.upload_scene import new_acquisition, photos, send, sent
-from tests.support.worker_scene import until
 
 SHAPE = (6, 5, 4)
 CUBE = np.random.default_rng(0).integers(1, 4000, SHAPE).astype(np.uint16)
@@ -134,7 +129,7 @@ def test_a_file_that_leads_elsewhere_tells_nothing(kind: str, relative: bool, tm
     place = f"../../../../elsewhere/{secret.name}" if relative else str(secret)
     data = HOSTILE[kind](place, tmp_path)
     name = "x.tif" if kind == "ome" else "x.h5"
-    with serving(tmp_path / "service") as service:
+    with serving(tmp_path / "service", own_judge=True) as service:
         assert not shows_secret(uploaded(service, data, name))
 
 
@@ -144,7 +139,7 @@ def test_a_file_that_leads_elsewhere_tells_nothing(kind: str, relative: bool, tm
 def test_confinement_holds_alone_where_a_reader_would_follow(kind: str, sandbox: str, tmp_path: Path) -> None:
     secret = secrets_in(tmp_path / "elsewhere")[kind]
     data = HOSTILE[kind](str(secret), tmp_path)
-    with serving(tmp_path / "service", sandbox=sandbox) as service:
+    with serving(tmp_path / "service", sandbox=sandbox, own_judge=True) as service:
         judge: Judge = service.app.state.judge
         judge._command = (sys.executable, "-c", NAIVE, *judge._command[3:])
         file = uploaded(service, data, "x.tif" if kind == "ome" else "x.h5")
@@ -190,7 +185,7 @@ def test_other_formats_that_name_paths_write_and_tell_nothing(tmp_path: Path) ->
     with zipfile.ZipFile(out, "w") as archive:
         archive.writestr(link, str(secret))
     files["link.npz"] = out.getvalue()
-    with serving(tmp_path / "service") as service:
+    with serving(tmp_path / "service", own_judge=True) as service:
         for name, data in files.items():
             file = uploaded(service, data, name)
             assert not shows_secret(file), name
@@ -218,134 +213,12 @@ def test_photos_that_are_not_what_they_seem_tell_nothing(tmp_path: Path) -> None
         "a.eps": f"%!PS-Adobe-3.0 EPSF-3.0\n({secret}) (r) file\n".encode(),
         "a.fpx": bytes.fromhex("d0cf11e0a1b11ae1") * 100,
     }
-    with serving(tmp_path / "service") as service:
+    with serving(tmp_path / "service", own_judge=True) as service:
         client = service.client(("upload", "read"))
         acquisition = new_acquisition(client)
         for name, data in files.items():
             assert not shows_secret(sent(client, acquisition, "photo", name, data)), name
         assert sent(client, acquisition, "photo", "good.jpg", photos()[0].read_bytes())["state"] == "accepted"
-
-
-# ---- checks of a child's answer -------------------------------------------------------------------------
-
-PHOTO = {
-    "verdict": "accepted",
-    "code": None,
-    "reason": "",
-    "advice": "",
-    "suffix": ".jpg",
-    "width": 512,
-    "height": 512,
-    "sharpness": 0.01,
-    "marker_ids": [0, 1],
-    "dictionary_seen": None,
-}
-WHOLE = {"verdict": "accepted", "code": None, "reason": "", "advice": "", "suffix": ".h5", "part": "whole"}
-
-
-@pytest.mark.parametrize(
-    "answer",
-    [
-        None,
-        [],
-        "accepted",
-        {"died": True},
-        {**PHOTO, "verdict": "fine"},
-        {**PHOTO, "suffix": "/../../x"},
-        {**PHOTO, "suffix": ".jpg/../x"},
-        {**PHOTO, "code": "a b"},
-        {**PHOTO, "width": "wide"},
-        {**PHOTO, "marker_ids": list(range(MOST_ITEMS + 1))},
-        {**PHOTO, "sharpness": float("nan")},
-        {**PHOTO, "width": 10**30},
-        {**PHOTO, "more": [[[[[1]]]]]},
-        {k: v for k, v in PHOTO.items() if k != "suffix"},
-    ],
-)
-def test_an_answer_that_no_reader_gives_is_none(answer: object) -> None:
-    with pytest.raises(ValueError):  # noqa: PT011 - the message is for nobody
-        checked_verdict("photo", answer)
-
-
-def test_an_answer_is_shortened_and_its_wavelengths_are_plausible() -> None:
-    verdict = checked_verdict("photo", {**PHOTO, "reason": "a\x1b[31m" + "b" * 5000})
-    assert len(verdict["reason"]) <= LONGEST_TEXT
-    assert "\x1b" not in verdict["reason"]
-    for given, kept in (
-        ([400, 1000.5], [400, 1000.5]),
-        ([1000, 400], None),
-        ([-1.0, 5], None),
-        ([0.0, 1e300][:1], None),
-        ([1e-9, 2.0], None),
-        ([400, 1e9], None),
-        ("secret", None),
-        ([400, 500, 600], None),
-        (None, None),
-    ):
-        assert checked_verdict("part", {**WHOLE, "wavelength_nm": given})["wavelength_nm"] == kept
-
-
-POISON = """
-import json, os, signal, sys
-from specimap_core.screening import process as child
-from specimap_core.screening.verdict import Verdict
-
-def poison(task):
-    how = task["path"].rpartition("/")[2]
-    if how == "crash":
-        os.abort()
-    if how == "memory":
-        bytearray(1 << 40)
-    if how in ("twice", "huge"):
-        (writing,) = [int(name) for name in range(3, 64) if is_open(name)]
-        os.write(writing, (b'{"verdict": "accepted"}\\n' * 2) if how == "twice" else b"x" * 100)
-        for _ in range(4000 if how == "huge" else 0):
-            os.write(writing, b"x" * 100)
-    return Verdict(facts={"pid": os.getpid(), "parent": os.getppid()})
-
-def is_open(descriptor):
-    try:
-        os.fstat(descriptor)
-    except OSError:
-        return False
-    return True
-
-child.TASKS["cube"] = poison
-child.main()
-"""
-
-
-def test_a_file_costs_its_own_copy_and_no_other_files_answer(tmp_path: Path) -> None:
-    judge = Judge(load_settings(data_dir=tmp_path / "data"), os.environ, (sys.executable, "-c", POISON))
-    folder = tmp_path / "task"
-    folder.mkdir()
-    try:
-        first = judge.cube(folder / "good")
-        for how in ("crash", "memory", "twice", "huge", "crash"):
-            assert judge.cube(folder / how)["code"] == "judging_crashed", how
-            second = judge.cube(folder / "good")
-            assert second["verdict"] == "accepted"
-            assert second["pid"] not in (first["pid"], second["parent"])
-        # The same two children answered all of it.
-        assert len({second["parent"], first["parent"]}) <= 2
-        assert not list((tmp_path / "data" / "scratch" / "judging").iterdir())
-    finally:
-        judge.close()
-
-
-def test_a_copy_that_ends_while_it_waits_is_no_fault_of_the_next_file(tmp_path: Path) -> None:
-    judge = Judge(load_settings(data_dir=tmp_path / "data"), os.environ, (sys.executable, "-c", POISON))
-    folder = tmp_path / "task"
-    folder.mkdir()
-    try:
-        child = judge.cube(folder / "good")["parent"]
-        children = Path(f"/proc/{child}/task/{child}/children")
-        (waiting,) = until(lambda: children.read_text().split(), 20, "the next copy")
-        os.kill(int(waiting), signal.SIGKILL)
-        for _ in range(4):  # each of the two children is asked
-            assert judge.cube(folder / "good")["verdict"] == "accepted"
-    finally:
-        judge.close()
 
 
 def test_a_key_for_uploads_reads_no_database(service: Running) -> None:

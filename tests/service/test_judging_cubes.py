@@ -12,6 +12,7 @@ import httpx
 import numpy as np
 import pytest
 
+from specimap_core.screening.cube import judge_cube, judge_part
 from specimap_infra.settings import load_settings
 from specimap_service.acquisitions.judge import Judge
 from tests.support.cube_files import random_values, write_envi
@@ -196,6 +197,7 @@ def mutated(text: bytes, rng: np.random.Generator) -> bytes:
 
 
 def test_a_thousand_hostile_cubes(tmp_path: Path) -> None:
+    """All of them by the functions that judge, and some through a judging process, which says the same."""
     settings = load_settings(data_dir=tmp_path, judge_seconds=10, judge_memory_bytes=256 * 1024**2)
     settings.scratch.mkdir(parents=True)
     judge = Judge(settings, os.environ)
@@ -216,9 +218,14 @@ def test_a_thousand_hostile_cubes(tmp_path: Path) -> None:
                 for at in rng.integers(0, 140, 2):
                     damaged[at] = rng.choice(list(b"0123456789<>|,u1f8 "))
                 path.write_bytes(damaged)
-            part = judge.part(path, path.suffix, None)
-            verdict = judge.cube(path) if part["verdict"] != "refused" else part
+            verdict = judge_part(path, path.suffix, None).as_dict()
+            if verdict["verdict"] != "refused":
+                verdict = judge_cube(path).as_dict()
             assert verdict["verdict"] in ("accepted", "doubtful", "refused")
+            if k % 10 < 2:
+                heard = judge.part(path, path.suffix, None)
+                heard = judge.cube(path) if heard["verdict"] != "refused" else heard
+                assert (heard["verdict"], heard["code"]) == (verdict["verdict"], verdict["code"])
             assert verdict["verdict"] == "accepted" or (verdict["code"] and verdict["reason"] and verdict["advice"])
             codes[verdict["code"]] = codes.get(verdict["code"], 0) + 1
     finally:

@@ -67,3 +67,16 @@ def cut_out(path: Path, margin: float) -> None:
     height, width = image.shape[:2]
     part = image[: round(height * (1 - margin)), : round(width * (1 - margin))]
     cv2.imwrite(str(path), cv2.resize(part, (width, height), interpolation=cv2.INTER_CUBIC))
+
+
+def without_markers(path: Path, phantom: OnDisk) -> None:
+    """Paint grey over the cards in a photo."""
+    image = cv2.imread(str(path))
+    assert image is not None
+    names = [Path(n).name for n in phantom.truth.photo_names]
+    view = phantom.truth.views[names.index(path.name)]
+    for corners in phantom.truth.marker_corners:
+        middle = corners.mean(0)
+        card = np.round(view.project(middle + 1.3 * (corners - middle))).astype(np.int32)
+        cv2.fillConvexPoly(image, card, TRAY_GREY)
+    cv2.imwrite(str(path), image, [cv2.IMWRITE_JPEG_QUALITY, 95])

@@ -5,9 +5,11 @@ from __future__ import annotations
 import struct
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import ExifTags, Image
 
 from specimap_core.photos.reading import AcquisitionSettings
 
@@ -29,4 +31,21 @@ def bomb(path: Path, side: int = 30000) -> Path:
 
     header = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0" * 10_000)))
+    return path
+
+
+def written(path: Path, image: NDArray[np.uint8], kind: str, orientation: int | None = None, **options: Any) -> Path:
+    """A photo in a format of Pillow's name."""
+    exif = Image.Exif()
+    if orientation:
+        exif[ExifTags.Base.Orientation] = orientation
+    picture = Image.fromarray(image)
+    if kind == "MPO":
+        options = {"save_all": True, "append_images": [picture.resize((30, 20))], **options}
+    if kind in ("JPEG", "MPO", "HEIF", "WEBP", "AVIF"):
+        options = {"quality": 95, **options}
+    if kind != "BMP":
+        # As bytes: for HEIF the writer then adds the rotation that readers go by, as phones do.
+        options["exif"] = exif.tobytes()
+    picture.save(path, kind, **options)
     return path

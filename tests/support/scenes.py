@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from specimap_cli.app import app
 from specimap_core.bundle_adjust.solver import MarkerScene
 from specimap_core.cloud import Cloud
+from specimap_core.errors import StageFailedError
 from specimap_core.fiducials.observations import Observations, corners_of
 from specimap_core.geometry.cameras import Array, Floats, Intrinsics, Pose, look_at, rotation_from_vector
 from specimap_core.pipeline.outputs import Inputs
@@ -24,9 +25,12 @@ from specimap_core.report.model import Report
 from specimap_core.surface.fusion import Mesh, vertex_normals
 from specimap_core.truth.truth_file import Truth
 from specimap_validation.phantom import PhantomSettings, load_truth, write_cube, write_phantom
+from tests.support.shared_folders import SharedFolders
 
 SMALL = PhantomSettings(photos=12, photo_size=384, cube_rows=128, cube_cols=160, bands=16, mesh_divisions=64)
 EDGE_MM = 6.8
+UNNAMED = {"internal_error", StageFailedError.code}
+"""Codes of failures that no check foresaw."""
 
 
 # ---- marker layouts without pictures ------------------------------------------------------------------
@@ -123,6 +127,12 @@ def phantom_on_disk(folder: Path, settings: PhantomSettings) -> OnDisk:
     return OnDisk(folder, write_phantom(settings, folder))
 
 
+def shared_phantom(shared_folders: SharedFolders, settings: PhantomSettings) -> OnDisk:
+    """A phantom that is written once for all processes; nobody changes it."""
+    folder = shared_folders.made("phantom", settings, lambda folder: write_phantom(settings, folder))
+    return OnDisk(folder, load_truth(folder))
+
+
 def cube_with(values: NDArray[np.uint16], like: OnDisk, folder: Path) -> Path:
     """Write an altered cube; returns its header."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -142,6 +152,16 @@ class Finished:
         """A copy to run into again: its stages 1 and 2 are taken over."""
         shutil.copytree(self.out, folder)
         return folder
+
+
+def shared_run(shared_folders: SharedFolders, acquisition: Path) -> Finished:
+    """A run on a folder with ``rgb`` and ``hsi``, made once for all processes; copy it before running into it again."""
+    inputs = Inputs(acquisition / "rgb", acquisition / "hsi" / "hsi.hdr")
+    made = shared_folders.made(
+        "run", acquisition, lambda folder: run_pipeline(inputs, folder / "out", PipelineSettings())
+    )
+    out = made / "out"
+    return Finished(out, Report.model_validate_json((out / "report.json").read_text(encoding="utf-8")))
 
 
 def read_corners(out: Path) -> tuple[list[int], Floats]:
@@ -231,17 +251,18 @@ def as_array(values: object) -> Array:
 
 
 @pytest.fixture(scope="session")
-def small(tmp_path_factory: pytest.TempPathFactory) -> OnDisk:
-    """A small phantom, written once."""
-    return phantom_on_disk(tmp_path_factory.mktemp("small"), SMALL)
+def small(shared_folders: SharedFolders) -> OnDisk:
+    """A small phantom."""
+    return shared_phantom(shared_folders, SMALL)
 
 
 @pytest.fixture(scope="session")
-def finished(small: OnDisk, tmp_path_factory: pytest.TempPathFactory) -> Finished:
+def other(shared_folders: SharedFolders) -> OnDisk:
+    """Another specimen in another layout of markers with the same ids."""
+    return shared_phantom(shared_folders, replace(SMALL, seed=2, bands=4))
+
+
+@pytest.fixture(scope="session")
+def finished(shared_folders: SharedFolders, small: OnDisk) -> Finished:
     """One whole run on the small phantom; copy it before running into it again."""
-    out = tmp_path_factory.mktemp("finished") / "out"
-    report = run_pipeline(Inputs(small.photos, small.header), out, PipelineSettings())
-    return Finished(out, report)
-
-
-__all__ = ["Finished", "OnDisk", "finished", "load_truth", "small"]
+    return shared_run(shared_folders, small.folder)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from unittest import mock
 
 import httpx
 import pytest
@@ -18,12 +22,14 @@ from fastapi import FastAPI
 
 from specimap_infra.database import Database
 from specimap_infra.logs import SHARED
-from specimap_infra.migrate import migrate
 from specimap_infra.settings import ServiceSettings, load_settings
 from specimap_infra.storage import Storage
+from specimap_service.acquisitions import dependencies
+from specimap_service.acquisitions.judge import Judge
 from specimap_service.app import create_app
 from specimap_service.auth.keys import new_key
 from specimap_service.connections import Connection
+from tests.support.databases import create_tables
 
 ALL_SCOPES = ("upload", "read", "label", "admin")
 
@@ -64,9 +70,40 @@ class Running:
         return client
 
 
+class SharedJudge(Judge):
+    """The judging processes of all services of a test process, since their start takes longer than most tests."""
+
+    def __init__(self) -> None:
+        self._folder = TemporaryDirectory(prefix="judging-")
+        super().__init__(load_settings(data_dir=self._folder.name), os.environ)
+
+    def close(self) -> None:
+        """A service that ends leaves them to the next one."""
+
+    def end(self) -> None:
+        """End them."""
+        super().close()
+        self._folder.cleanup()
+
+
+@cache
+def shared_judge() -> SharedJudge:
+    """The one of this process."""
+    return SharedJudge()
+
+
+def pytest_sessionfinish() -> None:
+    """End what was started."""
+    if shared_judge.cache_info().currsize:
+        shared_judge().end()
+
+
 @contextmanager
-def serving(folder: Path, **given: object) -> Iterator[Running]:
-    """Serve from a folder until the block ends; ``given`` are settings."""
+def serving(folder: Path, *, own_judge: bool = False, **given: object) -> Iterator[Running]:
+    """Serve from a folder until the block ends; ``given`` are settings.
+
+    ``own_judge``: with judging processes of its own, for tests of these and of settings that concern them.
+    """
     # Requests of a whole suite would bury what a failing test prints.
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING))
     settings = load_settings(**{"data_dir": folder, "log_level": "warning", "min_free_bytes": 0, **given})
@@ -75,9 +112,10 @@ def serving(folder: Path, **given: object) -> Iterator[Running]:
         plain = structlog.dev.ConsoleRenderer(exception_formatter=structlog.dev.plain_traceback)
         structlog.configure(processors=[*SHARED, plain])
     database = Database.open(settings.database)
-    migrate(database)
+    create_tables(database)
     database.close()
-    app = create_app(settings)
+    with mock.patch.object(dependencies, "Judge", Judge if own_judge else lambda *_: shared_judge()):
+        app = create_app(settings)
     server = uvicorn.Server(
         uvicorn.Config(
             app, host="127.0.0.1", port=0, log_config=None, access_log=False, ws="none", lifespan="on", http=Connection

@@ -18,9 +18,9 @@ from typing import Any
 import httpx
 
 from specimap_infra.database import Database
-from specimap_infra.migrate import migrate
 from specimap_infra.settings import load_settings
 from specimap_service.auth.keys import new_key
+from tests.support.databases import create_tables
 from tests.support.places import SAMPLES
 
 TUS = {"Tus-Resumable": "1.0.0"}
@@ -116,7 +116,7 @@ def process_serving(folder: Path, **given: Any) -> Iterator[tuple[subprocess.Pop
 
     settings = {"data_dir": str(folder), "min_free_bytes": 0, "log_level": "error", **given}
     database = Database.open(load_settings(data_dir=folder).database)
-    migrate(database)
+    create_tables(database)
     database.close()
     process = subprocess.Popen(
         [sys.executable, "-c", SERVER, json.dumps(settings)],
@@ -138,7 +138,7 @@ def process_serving(folder: Path, **given: Any) -> Iterator[tuple[subprocess.Pop
 def key_in(folder: Path) -> str:
     """A key with all scopes, in the database of a folder that no server serves yet."""
     database = Database.open(load_settings(data_dir=folder).database)
-    migrate(database)
+    create_tables(database)
     row, key = new_key("test", ("upload", "read", "admin"))
     with database.session() as session:
         session.add(row)

@@ -21,11 +21,11 @@ import sqlalchemy as sa
 from specimap_infra import jobs
 from specimap_infra.database import Database
 from specimap_infra.ids import new_id
-from specimap_infra.migrate import migrate
 from specimap_infra.queue import JOBS, RUN_JOB, enqueue, queue_client
 from specimap_infra.settings import ServiceSettings, load_settings
 from specimap_infra.storage import Storage
 from specimap_infra.tables import FINAL_STATES, Acquisition, CloudRow, Job, JobEvent, Lease, StoredFile
+from tests.support.databases import create_tables
 from tests.support.places import SUPPORT
 
 HELD = f"{sys.executable} {SUPPORT / 'held_stage.py'}"
@@ -235,7 +235,7 @@ def shop(folder: Path, **given: object) -> Iterator[Shop]:
     environment = {f"SPECIMAP_{name.upper()}": str(value) for name, value in values.items()}
     settings = load_settings(**values)
     database = Database.open(settings.database)
-    migrate(database)
+    create_tables(database)
     hold = folder / "hold"
     hold.mkdir(parents=True)
     opened = Shop(settings, environment, database, Storage.open(settings), hold)

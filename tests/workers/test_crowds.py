@@ -7,6 +7,7 @@ import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import sqlalchemy as sa
@@ -142,7 +143,7 @@ def test_two_apis_and_three_workers_on_postgresql_and_s3(
     monkeypatch.setenv("AWS_ACCESS_KEY_ID", "test")
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "test")
     with postgres_url() as url, object_store("specimap") as endpoint:
-        common = {"database_url": url, "storage": "s3://specimap/site-1", "s3_endpoint": endpoint}
+        common: dict[str, Any] = {"database_url": url, "storage": "s3://specimap/site-1", "s3_endpoint": endpoint}
         with shop(tmp_path / "shop", **common) as yard:
             acquisition = yard.acquisition(small.photos, small.header)
             for k in range(3):

@@ -1,73 +1,19 @@
-"""Which of several arrays is the cube, which of its axes is which, and how a user names another."""
+"""Which of several arrays is the cube, and how a user names another."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 import tifffile
-from scipy import io as scipy_io
 
 from specimap_core.cube import open_cube
-from specimap_core.errors import CubeFormatError, CubeHeaderError, SpecimapError
-from tests.support.cube_files import check_reads, random_values, write_envi
+from specimap_core.errors import CubeFormatError, CubeHeaderError
+from tests.support.cube_files import check_reads, write_envi
+from tests.support.dataset_files import CONTAINERS, COUNTS, NM, SHARE, Writer, hdf5, matlab5, netcdf4, npz
 from tests.support.notices import messages
-
-NM = np.linspace(400, 1000, 11)
-COUNTS = random_values("u2")
-SHARE = np.random.default_rng(3).random((7, 5, 11)).astype("f4")
-Arrays = dict[str, Any]
-
-
-def hdf5(folder: Path, arrays: Arrays) -> Path:
-    with h5py.File(folder / "x.h5", "w") as f:
-        for name, values in arrays.items():
-            f[name] = values
-    return folder / "x.h5"
-
-
-def netcdf4(folder: Path, arrays: Arrays) -> Path:
-    """As netCDF4 writes it: groups, with dimension scales that name the axes."""
-    with h5py.File(folder / "x.nc", "w") as f:
-        for axis, size in (("line", 7), ("sample", 5), ("wavelength_axis", 11)):
-            f[axis] = np.zeros(size, "f4")
-            f[axis].make_scale(axis)
-        for name, values in arrays.items():
-            f[name] = values
-            if np.ndim(values) == 3:
-                for i, axis in enumerate(("line", "sample", "wavelength_axis")):
-                    f[name].dims[i].attach_scale(f[axis])
-    return folder / "x.nc"
-
-
-def npz(folder: Path, arrays: Arrays) -> Path:
-    np.savez(folder / "x.npz", **arrays)
-    return folder / "x.npz"
-
-
-def matlab5(folder: Path, arrays: Arrays) -> Path:
-    scipy_io.savemat(folder / "x.mat", nested(arrays))
-    return folder / "x.mat"
-
-
-def nested(arrays: Arrays) -> Arrays:
-    """``a/b`` as the field b of the struct a."""
-    found: Arrays = {}
-    for name, values in arrays.items():
-        *groups, last = name.split("/")
-        place = found
-        for group in groups:
-            place = place.setdefault(group, {})
-        place[last] = values
-    return found
-
-
-Writer = Callable[[Path, Arrays], Path]
-CONTAINERS: list[Writer] = [hdf5, netcdf4, npz, matlab5]
 
 
 @pytest.mark.parametrize("write", CONTAINERS)
@@ -186,118 +132,6 @@ def test_a_file_of_one_array_takes_no_name(tmp_path: Path, name: str) -> None:
     tifffile.imwrite(tmp_path / "x.tif", COUNTS.transpose(2, 0, 1), photometric="minisblack")
     with pytest.raises(CubeFormatError, match="one cube"):
         open_cube(Path(f"{tmp_path / name}::cube"))
-
-
-# ---- axes ------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("axes", [(0, 1, 2), (0, 2, 1), (2, 0, 1)])
-@pytest.mark.parametrize("write", [hdf5, npz, matlab5])
-def test_bands_by_the_wavelengths_length(tmp_path: Path, write: Writer, axes: tuple[int, int, int]) -> None:
-    cube = open_cube(write(tmp_path, {"cube": COUNTS.transpose(axes), "wavelengths": NM}))
-    check_reads(cube, COUNTS)
-    assert cube.warnings == ()
-
-
-def test_tiff_whose_pages_are_rows(tmp_path: Path) -> None:
-    told = {"wavelengths": NM.tolist()}
-    tifffile.imwrite(tmp_path / "x.tif", COUNTS, photometric="minisblack", metadata=told)
-    cube = open_cube(tmp_path / "x.tif")
-    check_reads(cube, COUNTS)
-    np.testing.assert_allclose(cube.wavelengths_nm, NM)
-    assert [w.code for w in cube.warnings] == ["axes_assumed"]
-
-
-def test_npy_that_looks_turned_is_said(tmp_path: Path) -> None:
-    np.save(tmp_path / "x.npy", np.zeros((3, 50, 60), "u1"))
-    assert "3 rows x 50 columns x 60 bands" in messages(open_cube(tmp_path / "x.npy").warnings)["axes_assumed"]
-    np.save(tmp_path / "y.npy", np.zeros((50, 60, 3), "u1"))
-    assert "axes_assumed" not in messages(open_cube(tmp_path / "y.npy").warnings)
-
-
-@pytest.mark.parametrize("names", [("x", "y"), ("samples", "lines"), ("longitude", "latitude"), ("cols", "rows")])
-def test_columns_before_rows(tmp_path: Path, names: tuple[str, str]) -> None:
-    with h5py.File(tmp_path / "x.nc", "w") as f:
-        f["data"] = COUNTS.transpose(1, 0, 2)
-        f["wavelengths"] = NM
-        for i, label in enumerate((*names, "bands")):
-            f["data"].dims[i].label = label
-    check_reads(open_cube(tmp_path / "x.nc"), COUNTS)
-
-
-def test_names_and_lengths_that_disagree(tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "x.nc", "w") as f:
-        f["data"], f["wavelengths"] = COUNTS, NM
-        for i, label in enumerate(("band", "y", "x")):
-            f["data"].dims[i].label = label
-    cube = open_cube(tmp_path / "x.nc")
-    check_reads(cube, COUNTS)
-    assert "11 wavelengths" in messages(cube.warnings)["axes_assumed"]
-
-
-# ---- MATLAB 5 --------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("packed", [False, True])
-@pytest.mark.parametrize("order", ["C", "F"])
-def test_matlab5_struct(tmp_path: Path, packed: bool, order: str) -> None:
-    content = {
-        "note": "x" * 3000,
-        "scan": {
-            "empty": np.zeros((0, 0)),
-            "words": "text",
-            "wavelengths": NM,
-            "unit": 1j,
-            "units": "nm",
-            "deep": {"er": {"Img": COUNTS.copy(order="F" if order == "F" else "C")}},
-            "small": np.uint8(3),
-        },
-    }
-    scipy_io.savemat(tmp_path / "x.mat", content, do_compression=packed)
-    cube = open_cube(tmp_path / "x.mat")
-    check_reads(cube, COUNTS)
-    np.testing.assert_array_equal(cube.wavelengths_nm, NM)
-    assert cube.warnings == ()
-    check_reads(open_cube(Path(f"{tmp_path}/x.mat::scan/deep/er/Img")), COUNTS)
-
-
-@pytest.mark.parametrize("packed", [False, True])
-def test_matlab5_cells_and_struct_arrays(tmp_path: Path, packed: bool) -> None:
-    cells = np.empty((1, 3), object)
-    cells[0] = [COUNTS, "text", NM]
-    structs = np.zeros((1, 2), [("cube", "O"), ("wavelengths", "O")])
-    structs[0, 0] = (COUNTS, NM)
-    structs[0, 1] = (SHARE, NM + 1)
-    scipy_io.savemat(tmp_path / "x.mat", {"c": cells}, do_compression=packed)
-    check_reads(open_cube(tmp_path / "x.mat"), COUNTS)
-    scipy_io.savemat(tmp_path / "y.mat", {"s": structs}, do_compression=packed)
-    with pytest.raises(CubeFormatError, match=r"'s\(2\)/cube'"):
-        open_cube(tmp_path / "y.mat")
-    second = open_cube(Path(f"{tmp_path}/y.mat::s(2)/cube"))
-    check_reads(second, SHARE)
-    np.testing.assert_array_equal(second.wavelengths_nm, NM + 1)
-
-
-@pytest.mark.parametrize("packed", [False, True])
-def test_matlab5_damaged_structs(tmp_path: Path, packed: bool) -> None:
-    path = tmp_path / "x.mat"
-    content = {"scan": {"wavelengths": NM, "cube": COUNTS, "list": np.array([1, "a", 2.5], object)}}
-    scipy_io.savemat(path, content, do_compression=packed)
-    whole = path.read_bytes()
-    rng = np.random.default_rng(7)
-    refused = 0
-    for trial in range(400):
-        damaged = bytearray(whole[: rng.integers(1, len(whole))] if trial % 3 == 0 else whole)
-        for at in rng.integers(100, max(101, min(len(damaged), 600)), 4):
-            if at < len(damaged):
-                damaged[at] = int(rng.integers(256))
-        path.write_bytes(damaged)
-        try:
-            cube = open_cube(path)
-            cube.read_rows(0, cube.rows)
-        except SpecimapError:
-            refused += 1
-    assert refused > 200
 
 
 def test_hdf5_with_types_that_numpy_does_not_know(tmp_path: Path) -> None:

@@ -19,7 +19,8 @@ from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.truth.judge import TruthComparison, compare_with_truth
 from specimap_core.truth.truth_file import Truth
 from specimap_validation.phantom import load_truth
-from tests.support.scenes import Finished, OnDisk, assert_same_result, read_corners
+from tests.support.scenes import Finished, OnDisk, assert_same_result, read_corners, shared_run
+from tests.support.shared_folders import SharedFolders
 
 
 def judged(out: Path, truth: Truth) -> TruthComparison:
@@ -140,17 +141,17 @@ def test_the_published_forms_run_too(finished: Finished, small: OnDisk, tmp_path
 # ---- the full-size phantom ----------------------------------------------------------------------------
 
 
-def test_phantom_a_meets_its_targets(data_dir: Path, tmp_path: Path) -> None:
+def test_phantom_a_meets_its_targets(data_dir: Path, shared_folders: SharedFolders) -> None:
     folder = data_dir / "phantom_a"
-    report = run_pipeline(Inputs(folder / "rgb", folder / "hsi" / "hsi.hdr"), tmp_path / "out", PipelineSettings())
-    against = judged(tmp_path / "out", load_truth(folder))
+    run = shared_run(shared_folders, folder)
+    against = judged(run.out, load_truth(folder))
     assert 0.02 < against.median <= 0.12
     assert 0.05 < against.p95 <= 0.5
     assert against.coverage >= 0.97
     assert 1e-7 < abs(against.scale) <= 0.003
-    assert 0.001 < report.corner_2d_mm.mean <= 0.03
-    assert 0.001 < report.corner_3d_mm.median <= 0.15
-    assert len(report.photos.used) == 24
+    assert 0.001 < run.report.corner_2d_mm.mean <= 0.03
+    assert 0.001 < run.report.corner_3d_mm.median <= 0.15
+    assert len(run.report.photos.used) == 24
 
 
 def test_half_of_phantom_a_is_enough(data_dir: Path, tmp_path: Path) -> None:

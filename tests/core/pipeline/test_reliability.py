@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from specimap_core.pipeline.outputs import Inputs
-from specimap_core.pipeline.run import run_pipeline
-from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.truth.judge import judge_with_sigma
-from specimap_validation.phantom import PhantomSettings, write_phantom
+from specimap_validation.phantom import PhantomSettings
+from tests.support.scenes import shared_phantom, shared_run
+from tests.support.shared_folders import SharedFolders
 
 MEDIUM: dict[str, Any] = {
     "photos": 18,
@@ -37,10 +36,9 @@ ONE, TWO = 0.68, 0.95
 Shares = tuple[float, float]
 
 
-def shares_of(folder: Path, out: Path) -> Shares:
-    """Run on an acquisition with truth; shares of the errors within one and two stated standard deviations."""
-    run_pipeline(Inputs(folder / "rgb", folder / "hsi" / "hsi.hdr"), out, PipelineSettings())
-    judged = judge_with_sigma(out, folder)
+def shares_of(shared_folders: SharedFolders, folder: Path) -> Shares:
+    """Shares of a run's errors, on an acquisition with truth, within one and two stated standard deviations."""
+    judged = judge_with_sigma(shared_run(shared_folders, folder).out, folder)
     assert len(judged.sigma_mm) > 1000
     assert (judged.sigma_mm > 0).all()
     # A constant would tell nothing of one point against another.
@@ -49,14 +47,12 @@ def shares_of(folder: Path, out: Path) -> Shares:
 
 
 @pytest.fixture(scope="module")
-def own(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Shares]:
+def own(shared_folders: SharedFolders) -> dict[str, Shares]:
     """Shares on the own phantoms."""
-    found = {}
-    for name, settings in PHANTOMS.items():
-        folder = tmp_path_factory.mktemp(name)
-        write_phantom(settings, folder / "in")
-        found[name] = shares_of(folder / "in", folder / "out")
-    return found
+    return {
+        name: shares_of(shared_folders, shared_phantom(shared_folders, settings).folder)
+        for name, settings in PHANTOMS.items()
+    }
 
 
 @pytest.mark.parametrize("name", PHANTOMS)
@@ -69,14 +65,14 @@ def test_stated_deviations_hold_on_average(own: dict[str, Shares]) -> None:
     assert_near((one, two), 0.06, 0.04)
 
 
-def test_stated_deviations_hold_on_path_traced_tissue(data_dir: Path, tmp_path: Path) -> None:
-    assert_near(shares_of(data_dir / "phantom_hard", tmp_path / "out"), 0.06, 0.04)
+def test_stated_deviations_hold_on_path_traced_tissue(data_dir: Path, shared_folders: SharedFolders) -> None:
+    assert_near(shares_of(shared_folders, data_dir / "phantom_hard"), 0.06, 0.04)
 
 
 @pytest.fixture(scope="module")
-def setter(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Shares:
+def setter(data_dir: Path, shared_folders: SharedFolders) -> Shares:
     """Shares on the path-traced phantom that has a part in setting sigma."""
-    return shares_of(data_dir / "phantom_a", tmp_path_factory.mktemp("setter") / "out")
+    return shares_of(shared_folders, data_dir / "phantom_a")
 
 
 def test_stated_deviations_are_not_too_small_where_they_were_set(setter: Shares) -> None:

@@ -31,7 +31,8 @@ from tests.support.moved_specimen import (
     textured,
     turned,
 )
-from tests.support.scenes import Finished, bump_mesh, phantom_on_disk
+from tests.support.scenes import Finished, bump_mesh, phantom_on_disk, shared_run
+from tests.support.shared_folders import SharedFolders
 
 
 def shift_in(stage2: Stage2, cube: Cube) -> Shift | None:
@@ -113,10 +114,9 @@ def test_defects_are_not_taken_for_motion(tmp_path: Path, change: dict[str, obje
 
 
 @pytest.mark.parametrize("name", ["phantom_a", "phantom_hard"])
-def test_path_traced_specimens_did_not_move(data_dir: Path, tmp_path: Path, name: str) -> None:
-    header = data_dir / name / "hsi" / "hsi.hdr"
-    run_pipeline(Inputs(data_dir / name / "rgb", header), tmp_path / "out", PipelineSettings())
-    shift = shift_in(stage2_of(tmp_path / "out"), open_cube(header))
+def test_path_traced_specimens_did_not_move(data_dir: Path, shared_folders: SharedFolders, name: str) -> None:
+    run = shared_run(shared_folders, data_dir / name)
+    shift = shift_in(stage2_of(run.out), open_cube(data_dir / name / "hsi" / "hsi.hdr"))
     assert shift is not None
     assert not shift.significant
     assert 1e-4 < shift.moved_mm < TOLERANCE_MM

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from specimap_core.report.quality_gates import gated, outlying_photos
 from specimap_core.report.wording import GRAVE, WARNING_ADVICE, checks, verdict
 from tests.support.broken_sets import card_moved, copied, sheared
 from tests.support.document_scene import full_report, square
-from tests.support.scenes import EDGE_MM, SMALL, Finished, OnDisk, marker_scene, phantom_on_disk, run_refused, specimap
+from tests.support.scenes import EDGE_MM, Finished, OnDisk, marker_scene, run_refused, specimap
 
 # ---- figures ------------------------------------------------------------------------------------------
 
@@ -202,16 +201,16 @@ def test_photos_from_one_side_are_said_to_leave_holes(small: OnDisk, tmp_path: P
     assert "coverage_low" in codes(ran(photos, small.header, tmp_path / "out"))
 
 
-def test_the_cube_of_another_layout_is_refused(small: OnDisk, finished: Finished, tmp_path: Path) -> None:
-    other = phantom_on_disk(tmp_path / "other", replace(SMALL, seed=2, bands=4))
+def test_the_cube_of_another_layout_is_refused(
+    small: OnDisk, other: OnDisk, finished: Finished, tmp_path: Path
+) -> None:
     out = finished.copy_to(tmp_path / "out")
     refusal = run_refused(small.photos, other.header, out)
     assert refusal["code"] == "registration_failed"
     assert "elsewhere in the cube than in the photos" in str(refusal["message"])
 
 
-def test_a_photo_of_elsewhere_is_left_out_and_nothing_else_said(small: OnDisk, tmp_path: Path) -> None:
-    other = phantom_on_disk(tmp_path / "other", replace(SMALL, seed=2, bands=2))
+def test_a_photo_of_elsewhere_is_left_out_and_nothing_else_said(small: OnDisk, other: OnDisk, tmp_path: Path) -> None:
     photos = copied(small.photos, tmp_path / "photos")
     shutil.copy(other.photos / "view_004.jpg", photos / "elsewhere.jpg")
     sheared(photos / "view_003.jpg", 10)

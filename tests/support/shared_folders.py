@@ -1,0 +1,46 @@
+"""Folders made once for all processes of a test run: phantoms, and runs of the pipeline on them."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+
+@dataclass(frozen=True)
+class SharedFolders:
+    """Folders under ``root``, each made by the first process that asks for it; the others wait."""
+
+    root: Path
+
+    def made(self, name: str, recipe: object, make: Callable[[Path], object]) -> Path:
+        """The folder of a recipe, which ``make`` fills where it is not there yet. Nobody writes to it afterwards.
+
+        ``recipe``: whatever its content depends on; its ``repr`` is the key.
+        """
+        key = hashlib.sha256(repr(recipe).encode()).hexdigest()[:12]
+        folder = self.root / f"{name}-{key}"
+        with open(self.root / f"{folder.name}.lock", "w", encoding="ascii") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not folder.exists():
+                # A process that failed may have left a part.
+                unfinished = self.root / f"{folder.name}.{os.getpid()}"
+                unfinished.mkdir()
+                make(unfinished)
+                unfinished.rename(folder)
+        return folder
+
+
+@pytest.fixture(scope="session")
+def shared_folders(tmp_path_factory: pytest.TempPathFactory) -> SharedFolders:
+    """Folders that all processes of this test run share."""
+    own = tmp_path_factory.getbasetemp()
+    # With xdist each process has a folder of its own in that of the run.
+    root = (own.parent if os.environ.get("PYTEST_XDIST_WORKER") else own) / "shared"
+    root.mkdir(exist_ok=True)
+    return SharedFolders(root)
