@@ -25,13 +25,11 @@ JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 PriorityName = Literal["intraoperative", "routine", "research"]
 
 
-def _option(name: str, **given: Any) -> Any:
-    """A field that is as the run's option of that name, but for what is ``given``."""
-    option, default = OPTIONS[name], getattr(DEFAULTS, name)
-    rules: dict[str, Any] = {"default": default, "description": option.meaning}
-    if not option.choices:
-        rules |= _bounds(name)
-    return Field(**{**rules, **given})
+def _option(name: str) -> Any:
+    """A field with the default, the range and the meaning of the run's option of that name."""
+    option = OPTIONS[name]
+    bounds = {} if option.choices else _bounds(name)
+    return Field(default=getattr(DEFAULTS, name), description=option.meaning, **bounds)
 
 
 def _bounds(name: str) -> dict[str, Any]:
@@ -52,9 +50,7 @@ class JobSettings(BaseModel):
     adjustment: Adjustment = _option("adjustment")
     r_pc: float = _option("r_pc")
     r_reg: float = _option("r_reg")
-    backend: Backend = _option(
-        "backend", description="Reconstruction backend; the learned ones need weights on the worker."
-    )
+    backend: Backend = _option("backend")
     features: Features = _option("features")
     working_px: int = _option("working_px")
     dictionary: Dictionary | None = Field(default=None, description="Marker dictionary; by default the acquisition's.")

@@ -38,8 +38,6 @@ def part_of(answer: dict[str, Any], name: str) -> dict[str, Any]:
 @pytest.fixture
 def bare(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     """No variable of a backend is set."""
-    import os
-
     for name in [n for n in os.environ if n.startswith(("SPECIMAP_MAST3R_", "SPECIMAP_DA3_"))]:
         monkeypatch.delenv(name)
     return monkeypatch
@@ -98,6 +96,11 @@ def test_a_setting_that_does_not_read_is_told(bare: pytest.MonkeyPatch) -> None:
     assert status == 0
     assert "SPECIMAP_MAST3R_GRAPH is 'all'" in out
     assert "It takes auto, complete or swin-K." in out
+
+
+def test_a_wrong_device_says_nothing_of_the_networks(bare: pytest.MonkeyPatch) -> None:
+    bare.setenv("SPECIMAP_DENSE_DEVICE", "cuda")
+    assert "SPECIMAP_DENSE_DEVICE" not in ask()[1]
 
 
 def test_an_interpreter_tells_what_it_imports() -> None:

@@ -76,7 +76,10 @@ class RunOptions:
     working_px: int = field(
         default=1280, metadata=_number(320, 8192, "Longer side that larger photos are brought to, pixels.")
     )
-    backend: Backend = field(default="colmap", metadata=_choice(Backend, "Reconstruction backend."))
+    backend: Backend = field(
+        default="colmap",
+        metadata=_choice(Backend, "Reconstruction backend; the learned ones need weights on the worker."),
+    )
     features: Features = field(
         default="auto", metadata=_choice(Features, "Features that locate photos which the markers leave open.")
     )

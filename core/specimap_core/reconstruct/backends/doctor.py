@@ -14,7 +14,7 @@ from typing import Any
 
 from specimap_core.errors import SpecimapError
 from specimap_core.reconstruct.backends.da3 import settings as da3
-from specimap_core.reconstruct.backends.environment import backends_from
+from specimap_core.reconstruct.backends.environment import da3_from, mast3r_from
 from specimap_core.reconstruct.backends.mast3r import settings as mast3r
 from specimap_core.reconstruct.backends.probe import cpu_count, driver_gpus, probe
 from specimap_core.reconstruct.backends.weights import Weights
@@ -188,7 +188,7 @@ def _weights_facts(weights: Weights) -> dict[str, Any]:
 
 def _mast3r(environment: Mapping[str, str]) -> _Plan:
     try:
-        chosen = backends_from(environment, mast3r.NAME).mast3r
+        chosen = mast3r_from(environment)
     except SpecimapError as error:
         return _Plan(mast3r.NAME, mast3r.PREFIX, sys.executable, (), (), error)
     steps = (
@@ -200,7 +200,7 @@ def _mast3r(environment: Mapping[str, str]) -> _Plan:
 
 def _da3(environment: Mapping[str, str]) -> _Plan:
     try:
-        chosen = backends_from(environment, da3.NAME).da3
+        chosen = da3_from(environment)
     except SpecimapError as error:
         return _Plan(da3.NAME, da3.PREFIX, sys.executable, (), (), error)
     steps = (

@@ -48,13 +48,22 @@ def backends_from(environment: Mapping[str, str], chosen: str | None = None) -> 
     Raises:
         SettingsError: a value cannot be; details name the variable.
     """
-    found, hash_cache = BackendSettings(device=dense_device(environment)), hash_cache_in(environment)
+    found = BackendSettings(device=dense_device(environment))
     if chosen in (None, mast3r.NAME):
-        network = mast3r.settings_from_environment(environment)
-        found = replace(found, mast3r=replace(network, hash_cache=hash_cache))
+        found = replace(found, mast3r=mast3r_from(environment))
     if chosen in (None, da3.NAME):
-        found = replace(found, da3=replace(da3.settings_from_environment(environment), hash_cache=hash_cache))
+        found = replace(found, da3=da3_from(environment))
     return found
+
+
+def mast3r_from(environment: Mapping[str, str]) -> Mast3rSettings:
+    """MASt3R's settings, with the user's cache; raises as :func:`backends_from` does."""
+    return replace(mast3r.settings_from_environment(environment), hash_cache=hash_cache_in(environment))
+
+
+def da3_from(environment: Mapping[str, str]) -> Da3Settings:
+    """The same of Depth Anything 3."""
+    return replace(da3.settings_from_environment(environment), hash_cache=hash_cache_in(environment))
 
 
 def backend_found(name: str, backends: BackendSettings) -> tuple[Mast3rSettings | Da3Settings, Weights] | None:

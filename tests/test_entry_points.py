@@ -134,7 +134,7 @@ def _file_of(module: str) -> Path:
     return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
 
 
-def test_threads_are_the_users_where_he_names_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_are_as_the_users_environment_says(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "3")
     limit_blas_threads()
     assert os.environ["OPENBLAS_NUM_THREADS"] == "3"
