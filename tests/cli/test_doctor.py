@@ -46,6 +46,7 @@ def bare(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
 # ---- on this machine ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_what_is_there_and_what_is_missing(bare: pytest.MonkeyPatch) -> None:
     status, out = ask("--json")
     (line,) = out.splitlines()
@@ -68,6 +69,7 @@ def test_what_is_there_and_what_is_missing(bare: pytest.MonkeyPatch) -> None:
     assert any("SPECIMAP_DA3_WEIGHTS" in m["do"] for m in part_of(answer, "da3")["missing"])
 
 
+@pytest.mark.slow
 def test_checkout_weights_and_interpreter_are_looked_at(tmp_path: Path, bare: pytest.MonkeyPatch) -> None:
     for needed in NEEDED:
         (tmp_path / needed).parent.mkdir(parents=True, exist_ok=True)

@@ -30,6 +30,7 @@ def listed(folder: Path, database_url: str = "") -> list[dict[str, Any]]:
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
+@pytest.mark.slow
 def test_key_is_made_before_the_first_start_and_opens_the_service(tmp_path: Path, any_database: str) -> None:
     done = keys(
         tmp_path, "create", "--name", "tablet 3", "--scope", "read", "--scope", "upload", database_url=any_database
@@ -61,6 +62,7 @@ def test_key_is_made_before_the_first_start_and_opens_the_service(tmp_path: Path
     assert listed(tmp_path, any_database)[0]["state"] == "revoked"
 
 
+@pytest.mark.slow
 def test_expiry_and_table(tmp_path: Path) -> None:
     later = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=400)
     done = keys(tmp_path, "create", "--name", "x" * 90, "--scope", "admin", "--expires", f"{later:%Y-%m-%d}")

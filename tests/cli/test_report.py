@@ -104,6 +104,7 @@ def test_the_cloud_s_attributes_stay_small(finished: Finished) -> None:
 # ---- the command --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_page_with_truth(finished: Finished, small: OnDisk, tmp_path: Path) -> None:
     target = tmp_path / "report.html"
     answer = command(finished.out, "--truth", small.folder, "--target", target, "--json")
@@ -124,6 +125,7 @@ def test_a_page_with_truth(finished: Finished, small: OnDisk, tmp_path: Path) ->
     assert "truth" not in without.ids
 
 
+@pytest.mark.slow
 def test_a_pdf(finished: Finished, tmp_path: Path) -> None:
     out = finished.copy_to(tmp_path / "out")
     answer = command(out, "--format", "pdf")

@@ -93,6 +93,7 @@ def test_the_same_run_again_repeats_nothing(finished: Finished, small: OnDisk, t
     assert (out / "report.json").read_bytes() == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("r_pc", ["0.05", "1.0"])
 def test_another_grid_repeats_stages_3_and_4_only(finished: Finished, small: OnDisk, tmp_path: Path, r_pc: str) -> None:
     out = finished.copy_to(tmp_path / "out")
@@ -108,6 +109,7 @@ def test_another_grid_repeats_stages_3_and_4_only(finished: Finished, small: OnD
 KILLED = [("reconstruct", 0.5, []), ("adjust", 0.3, ["reconstruct"]), ("register", 0.1, ["reconstruct", "adjust"])]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stage", "share", "kept"), KILLED)
 def test_a_killed_run_goes_on_where_it_was(
     small: OnDisk, finished: Finished, tmp_path: Path, stage: str, share: float, kept: list[str]
@@ -130,6 +132,7 @@ def test_a_killed_run_goes_on_where_it_was(
     assert_same_result(out, finished.out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "stage", "share"),
     [(signal.SIGINT, "reconstruct", 0.3), (signal.SIGTERM, "adjust", 0.1), (signal.SIGINT, "register", 0.0)],

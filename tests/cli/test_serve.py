@@ -23,6 +23,8 @@ from tests.support.places import ROOT
 from tests.support.scenes import OnDisk
 from tests.support.worker_scene import processes_of, until
 
+pytestmark = pytest.mark.slow
+
 PROGRAM = (sys.executable, "-c", "from specimap_cli import main; main()")
 
 

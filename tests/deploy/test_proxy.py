@@ -193,6 +193,7 @@ def test_a_key_stays_with_one_replica_and_keys_share_the_replicas(proxy: Proxy) 
     assert set(names.values()) == {"a", "b"}
 
 
+@pytest.mark.slow
 def test_requests_go_on_without_one_replica_and_no_key_is_logged(proxy: Proxy) -> None:
     first = proxy.name("spk_secret")
     gone = [one.name for one in proxy.replicas].index(first)

@@ -259,6 +259,7 @@ def lists_and_ranges(reader: Reader) -> None:
     assert (reader.folder / "head.ply").read_bytes() == mesh[:100]
 
 
+@pytest.mark.slow
 def test_everything_on_the_page_does_what_it_says(reader: Reader) -> None:
     for part in (keys, errors, uploads, jobs_and_events, webhook, results, labels, lists_and_ranges):
         part(reader)

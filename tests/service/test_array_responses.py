@@ -150,6 +150,7 @@ def test_what_is_not_known_is_null(service: Running, tmp_path: Path) -> None:
 # ---- many clients, buckets --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_many_clients_get_their_own_spectra(reader: httpx.Client, cloud: Cloud) -> None:
     truth = cloud.spectra(slice(None))
 
@@ -168,6 +169,7 @@ def test_many_clients_get_their_own_spectra(reader: httpx.Client, cloud: Cloud) 
         list(pool.map(ask, range(64)))
 
 
+@pytest.mark.slow
 def test_a_bucket_serves_alike(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_ACCESS_KEY_ID", "test")
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "test")

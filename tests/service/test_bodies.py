@@ -141,6 +141,7 @@ BODIES = {
 }
 
 
+@pytest.mark.slow
 def test_no_body_makes_a_route_fail(shared: Running) -> None:
     headers = {"Authorization": f"Bearer {shared.key()}", "Tus-Resumable": "1.0.0"}
     with httpx.Client(base_url=shared.url, headers=headers, trust_env=False, timeout=60) as client:

@@ -100,6 +100,7 @@ def test_every_body_has_an_example(contract: dict[str, Any]) -> None:
             assert {"example", "examples"} & said, f"{method} {path}"
 
 
+@pytest.mark.slow
 def test_generated_requests_are_answered_as_the_contract_says(service: Running, tmp_path: Path) -> None:
     result = put_result(service, tmp_path / "result")
     (tmp_path / "schemathesis.toml").write_text(

@@ -75,6 +75,7 @@ def test_job_is_queued_with_its_workflow_and_first_event(any_service: Running) -
     assert (entry["action"], entry["correlation_id"]) == ("job.create", "theatre-2.0001")
 
 
+@pytest.mark.slow
 def test_job_and_workflow_are_there_together_or_not_at_all(
     any_service: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:

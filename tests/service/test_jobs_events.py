@@ -176,6 +176,7 @@ def test_stream_of_a_deleted_job_ends_and_an_idle_one_is_kept_alive(
         assert all(not line or line.startswith(":") for line in lines)
 
 
+@pytest.mark.slow
 def test_stream_lives_through_an_outage_of_the_database(tmp_path: Path) -> None:
     """No connection to the database can be had for three seconds, and those that were there are cut."""
     with postgres_url() as url, serving(tmp_path, database_url=url) as service, postgres_server() as server:

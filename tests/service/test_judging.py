@@ -62,6 +62,7 @@ def verdict_of(path: Path, data: bytes, dictionary: str = "DICT_4X4_50", others:
     return judged.code or "accepted"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", SHARP[::4], ids=lambda p: p.name)
 def test_sharp_and_blurred(path: Path, tmp_path: Path) -> None:
     image, at = bgr(path), tmp_path / "x"
@@ -74,6 +75,7 @@ def test_sharp_and_blurred(path: Path, tmp_path: Path) -> None:
         assert verdict_of(at, jpeg(bad), others=usual) == "photo_blurred"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("folder", ["real_aruco_apple", "real_exif_rotated"])
 def test_real_photos_sharp_and_blurred(data_dir: Path, folder: str, tmp_path: Path) -> None:
     for path in sorted((data_dir / folder / "images").glob("*.jpg"))[::8]:
@@ -84,6 +86,7 @@ def test_real_photos_sharp_and_blurred(data_dir: Path, folder: str, tmp_path: Pa
             assert verdict_of(at, jpeg(bad), "DICT_7X7_1000") == "photo_blurred"
 
 
+@pytest.mark.slow
 def test_light_size_and_markers(tmp_path: Path) -> None:
     image, at = bgr(SHARP[0]), tmp_path / "x"
     assert verdict_of(at, jpeg(np.asarray(np.clip(image.astype(int) * 3, 0, 255), np.uint8))) == "photo_overexposed"
@@ -223,6 +226,7 @@ def test_a_child_that_does_not_start_is_no_fault_of_the_file(tmp_path: Path) -> 
         judge.cube(Path("good"))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 def test_child_has_no_keys_and_dies_with_the_service(tmp_path: Path) -> None:
     key = key_in(tmp_path)

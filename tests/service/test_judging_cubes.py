@@ -196,6 +196,7 @@ def mutated(text: bytes, rng: np.random.Generator) -> bytes:
     return b"\n".join(lines)
 
 
+@pytest.mark.slow
 def test_a_thousand_hostile_cubes(tmp_path: Path) -> None:
     """All of them by the functions that judge, and some through a judging process, which says the same."""
     settings = load_settings(data_dir=tmp_path, judge_seconds=10, judge_memory_bytes=256 * 1024**2)

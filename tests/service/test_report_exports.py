@@ -52,6 +52,7 @@ def made(service: Running, client: httpx.Client, result: Result, format: str) ->
     return client.get(told["links"]["content"])
 
 
+@pytest.mark.slow
 def test_round_trip(service: Running, client: httpx.Client, result: Result, tmp_path: Path) -> None:
     with_photos(service, result, tmp_path / "whole")
     answer = made(service, client, result, "html")

@@ -94,6 +94,7 @@ def half_sent(url: str, at: str, key: str, data: bytes, upto: int) -> socket.soc
     return connection
 
 
+@pytest.mark.slow
 def test_a_process_killed_in_the_middle_of_a_chunk(tmp_path: Path) -> None:
     data = noise(20_000_000)
     key = key_in(tmp_path)
@@ -151,6 +152,7 @@ def test_a_storage_that_fails_at_the_end_keeps_the_bytes(service: Running, monke
     assert result(client, at)["state"] == "finished"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "status", "code"), [(errno.ENOSPC, 507, "storage_full"), (errno.EIO, 503, "storage_unavailable")]
 )

@@ -42,6 +42,7 @@ def test_the_plan_runs_all_photos_once() -> None:
             plan(shares, seeds)
 
 
+@pytest.mark.slow
 def test_a_real_study_has_rows_and_refusals(small: OnDisk, tmp_path: Path) -> None:
     out = tmp_path / "study"
     arguments = ["study", "subsampling", str(small.folder), "--out", str(out), "--seeds", "1", "--json"]
@@ -85,6 +86,7 @@ PROGRAM = (
 )
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_a_study_in_order(small: OnDisk, tmp_path: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, "study", "subsampling", str(small.folder), "--out", str(tmp_path), "--json"],

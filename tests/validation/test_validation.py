@@ -59,6 +59,7 @@ def test_an_acquisition_without_truth_validates_nothing(small: OnDisk, tmp_path:
         cases((-1,), (), quick=True)
 
 
+@pytest.mark.slow
 def test_a_real_validation_of_one_phantom(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cases_module, "QUICK", TINY)
     monkeypatch.setattr(cases_module, "QUICK_DEFECTS", ("none",))

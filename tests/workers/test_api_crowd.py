@@ -13,10 +13,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
+
 from specimap_client import Client, Retries
 from specimap_service.auth.keys import new_key
 from tests.support.scenes import Finished, OnDisk
 from tests.support.worker_scene import QUICK, Shop, assert_all_succeed, shop
+
+pytestmark = pytest.mark.slow
 
 JOBS = 200
 KILLS = 6

@@ -20,6 +20,8 @@ from tests.support.scenes import Finished, OnDisk
 from tests.support.service_scene import serving
 from tests.support.worker_scene import QUICK, assert_all_succeed, shop, until
 
+pytestmark = pytest.mark.slow
+
 JOBS = 60
 KILLS = 6
 

@@ -19,6 +19,8 @@ from specimap_workers.stage_process import SPARES
 from tests.support.scenes import Finished, OnDisk
 from tests.support.worker_scene import Shop, processes_of, shop, until
 
+pytestmark = pytest.mark.slow
+
 TAKEOVER_SECONDS = 20.0
 
 

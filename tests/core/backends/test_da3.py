@@ -49,6 +49,7 @@ def weights(tmp_path: Path) -> Path:
 # ---- an oracle for a network --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_true_depth_in_any_unit_makes_a_true_cloud(
     small: OnDisk, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -85,6 +86,7 @@ def test_true_depth_in_any_unit_makes_a_true_cloud(
     assert len(report.photos.used) == 12
 
 
+@pytest.mark.slow
 def test_depth_that_fits_no_marker_is_no_depth(captured: Captured, weights: Path, tmp_path: Path) -> None:
     script = write_script(
         tmp_path,

@@ -40,6 +40,7 @@ def outward(found: list[Detection]) -> float:
     return float(np.mean(out))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [enlarged, shrunk])
 def test_photos_resized_as_encoded_keep_their_markers_size(make: object) -> None:
     assert callable(make)

@@ -112,6 +112,7 @@ def test_pixels_that_are_not_numbers(small: OnDisk, finished: Finished, tmp_path
     assert report.corner_2d_mm.mean < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["90", "180", "270", "fliplr", "flipud"])
 def test_a_turned_or_mirrored_cube_gives_the_same_places(
     small: OnDisk, finished: Finished, tmp_path: Path, how: str
@@ -150,6 +151,7 @@ def hidden(small: OnDisk, ids: tuple[int, ...]) -> Values:
     return values
 
 
+@pytest.mark.slow
 def test_a_marker_hidden_in_the_cube(small: OnDisk, finished: Finished, tmp_path: Path) -> None:
     out = finished.copy_to(tmp_path / "out")
     report = rerun(small, out, cube_with(hidden(small, (2,)), small, tmp_path / "one"))
@@ -165,6 +167,7 @@ def test_a_marker_hidden_in_the_cube(small: OnDisk, finished: Finished, tmp_path
     assert tree_of(out) == before
 
 
+@pytest.mark.slow
 def test_what_the_reader_assumed_is_said_where_no_marker_shows(
     small: OnDisk, finished: Finished, tmp_path: Path
 ) -> None:

@@ -46,12 +46,14 @@ def test_markers_of_another_dictionary(small: OnDisk, tmp_path: Path, given: str
     assert "DICT_4X4_1000" in str(refusal["advice"])
 
 
+@pytest.mark.slow
 def test_a_layout_of_one_marker_is_refused_at_the_cube(tmp_path: Path) -> None:
     phantom = phantom_on_disk(tmp_path, replace(SMALL, marker_ids=(5,), bands=4))
     refusal = run_refused(phantom.photos, phantom.header, tmp_path / "out")
     assert refusal["code"] == "markers_missing_in_cube"
 
 
+@pytest.mark.slow
 def test_other_layouts_work(tmp_path: Path) -> None:
     """Nine markers of another dictionary and edge."""
     settings = replace(
@@ -124,6 +126,7 @@ def test_an_edge_that_exif_and_reason_contradict_is_refused(small: OnDisk, tmp_p
     assert "EXIF says 150 mm" in str(refusal["message"])
 
 
+@pytest.mark.slow
 def test_a_doubtful_edge_is_warned_of(small: OnDisk, tmp_path: Path) -> None:
     photos = with_subject(small.photos, tmp_path / "photos", 0.4)
     answer = specimap(

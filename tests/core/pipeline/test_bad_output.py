@@ -65,6 +65,7 @@ def test_output_folders_that_cannot_be_used(small: OnDisk, tmp_path: Path) -> No
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "code"), [(errno.ENOSPC, "storage_full"), (errno.EACCES, "output_not_writable")])
 @pytest.mark.parametrize("step", ["write_mesh_ply", "write_cloud", "write_preview"])
 def test_a_disk_that_refuses_leaves_the_earlier_results(

@@ -65,6 +65,7 @@ def stranger(shared_folders: SharedFolders) -> OnDisk:
     return shared_phantom(shared_folders, replace(SMALL, seed=3, marker_ids=(10, 11, 12, 13)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("second", ["other", "stranger"])
 def test_two_scenes(small: OnDisk, second: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     scene: OnDisk = request.getfixturevalue(second)
@@ -110,6 +111,7 @@ def shallow(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path, OnDisk], dict[st
 Pose = Callable[[Path, OnDisk], dict[str, str]]
 
 
+@pytest.mark.slow
 def test_a_few_foreign_and_bad_photos_are_refused_by_name(
     small: OnDisk, other: OnDisk, stranger: OnDisk, shallow: Pose, tmp_path: Path
 ) -> None:
@@ -137,6 +139,7 @@ def test_a_few_foreign_and_bad_photos_are_refused_by_name(
     }
 
 
+@pytest.mark.slow
 def test_photos_without_a_marker_are_located_by_features(small: OnDisk, shallow: Pose, tmp_path: Path) -> None:
     photos = copied(small.photos, tmp_path / "photos")
     for name in ("view_003.jpg", "view_011.jpg"):
@@ -157,6 +160,7 @@ def test_photos_held_both_ways_are_all_used(small: OnDisk, shallow: Pose, tmp_pa
     assert shallow(photos, small) == {}
 
 
+@pytest.mark.slow
 def test_photos_of_every_format_and_turn_are_used(small: OnDisk, shallow: Pose, tmp_path: Path) -> None:
     """A folder as several programs leave it: each photo in a format of its own, turned as EXIF says."""
     folder = tmp_path / "photos"

@@ -13,6 +13,8 @@ import pytest
 from tests.support.scenes import SMALL, UNNAMED, Finished, OnDisk, cube_with, shared_phantom, specimap
 from tests.support.shared_folders import SharedFolders
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="session")
 def tiny(shared_folders: SharedFolders) -> OnDisk:

@@ -65,6 +65,7 @@ CORNERS: dict[str, Callable[[Floats, np.random.Generator], Floats]] = {
 }
 
 
+@pytest.mark.slow
 @SWEEP
 @given(
     seed=st.integers(0, 10_000),
@@ -121,6 +122,7 @@ DEPTHS: dict[str, Callable[[int, float, np.random.Generator], Floats]] = {
 }
 
 
+@pytest.mark.slow
 @SWEEP
 @given(
     seed=st.integers(0, 10_000),
@@ -166,6 +168,7 @@ MESHES: dict[str, Callable[[Mesh], Shape]] = {
 }
 
 
+@pytest.mark.slow
 @SLOW_SWEEP
 @given(
     seed=st.integers(0, 10_000),

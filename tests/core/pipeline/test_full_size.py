@@ -13,6 +13,8 @@ from specimap_core.pipeline.run import run_pipeline
 from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.truth.judge import Judged, judge_with_sigma
 
+pytestmark = pytest.mark.slow
+
 SIZES = {"3000 x 3000": (3000, 3000), "4000 x 3000": (4000, 3000)}
 PHOTOS = 2
 """Every second photo of the sample."""

@@ -68,6 +68,7 @@ def test_spectra_and_flags_are_those_of_their_pixels(finished: Finished, small: 
     assert (card & said).sum() / (card | said).sum() > 0.8
 
 
+@pytest.mark.slow
 def test_a_run_repeats(finished: Finished, small: OnDisk, tmp_path: Path) -> None:
     heard: list[tuple[str, float]] = []
     run_pipeline(
@@ -111,6 +112,7 @@ def test_a_stop_is_heard_in_every_stage(finished: Finished, small: OnDisk, tmp_p
         assert not list(out.glob(".*.tmp"))
 
 
+@pytest.mark.slow
 def test_a_damaged_artefact_is_made_anew(finished: Finished, small: OnDisk, tmp_path: Path) -> None:
     out = finished.copy_to(tmp_path / "out")
     (out / "report.json").unlink()
@@ -141,6 +143,7 @@ def test_the_published_forms_run_too(finished: Finished, small: OnDisk, tmp_path
 # ---- the full-size phantom ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_phantom_a_meets_its_targets(data_dir: Path, shared_folders: SharedFolders) -> None:
     folder = data_dir / "phantom_a"
     run = shared_run(shared_folders, folder)
@@ -154,6 +157,7 @@ def test_phantom_a_meets_its_targets(data_dir: Path, shared_folders: SharedFolde
     assert len(run.report.photos.used) == 24
 
 
+@pytest.mark.slow
 def test_half_of_phantom_a_is_enough(data_dir: Path, tmp_path: Path) -> None:
     folder = data_dir / "phantom_a"
     photos = tmp_path / "photos"

@@ -18,6 +18,8 @@ from specimap_validation.phantom import PhantomSettings
 from tests.support.scenes import shared_phantom, shared_run
 from tests.support.shared_folders import SharedFolders
 
+pytestmark = pytest.mark.slow
+
 MEDIUM: dict[str, Any] = {
     "photos": 18,
     "photo_size": 448,

@@ -18,6 +18,8 @@ from specimap_core.reconstruct.features.choice import aliked_missing, feature_ki
 from specimap_core.reconstruct.resection import Locator
 from tests.support.feature_scene import Ring, angle_deg, epipolar_px, photo_of, ring
 
+pytestmark = pytest.mark.slow
+
 needs_aliked = pytest.mark.skipif(bool(aliked_missing()), reason="the packages of make learned are not installed")
 TARGET = np.array([0.0, 0.0, 3.0])
 PHOTO = 5

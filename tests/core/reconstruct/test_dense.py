@@ -15,6 +15,8 @@ from specimap_core.surface.refinement import pixel_footprint_mm
 from tests.support.matched_scene import Matched, matched
 from tests.support.true_depth import true_depth
 
+pytestmark = pytest.mark.slow
+
 SEEDS = (31, 32)
 GROSS_MM = 1.5
 """Depths farther off see another surface: they are counted, not averaged."""

@@ -93,6 +93,7 @@ def error_of(zooms: Floats, true: Floats) -> Floats:
 # ---- found against truth ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", BREATHING_SEEDS)
 def test_zooms_of_a_breathing_phantom_are_found(seed: int) -> None:
     scene = shown(seed, SPREAD)
@@ -104,6 +105,7 @@ def test_zooms_of_a_breathing_phantom_are_found(seed: int) -> None:
     assert np.corrcoef(np.log(zooms), true)[0, 1] > 0.9
 
 
+@pytest.mark.slow
 def test_zooms_of_layouts_are_found_as_well_as_stated() -> None:
     shares, chi = [], []
     for seed in range(3):
@@ -149,6 +151,7 @@ def test_poses_come_nearer_to_truth(seed: int) -> None:
 # ---- nothing is taken out where nothing breathes ------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [51, 52, 53])
 def test_steady_phantoms_stay_as_they_are(seed: int) -> None:
     scene = shown(seed, 0.0, 12, 384)

@@ -19,6 +19,8 @@ from specimap_core.surface.fusion import SurfaceSettings
 from specimap_validation.phantom import Phantom, PhantomSettings
 from tests.support.true_depth import true_depth
 
+pytestmark = pytest.mark.slow
+
 UP = np.array([0.0, 0.0, 1.0])
 
 

@@ -65,6 +65,7 @@ def test_soft_photos_are_brought_to_what_they_resolve() -> None:
         assert moved.marker_id == seen.marker_id
 
 
+@pytest.mark.slow
 def test_one_soft_photo_among_sharp_ones_changes_nothing() -> None:
     photos = [photo(shown(b), str(b)) for b in (0.35, 0.36, 0.37, 2.0)]
     assert own_resolution(photos, [detect_markers(p.grey, "DICT_4X4_50") for p in photos]) == 1

@@ -16,6 +16,8 @@ from specimap_core.reconstruct.features.sift import Sift, extract, match
 from specimap_core.reconstruct.resection import Locator
 from tests.support.scenes import OnDisk, rotation_deg
 
+pytestmark = pytest.mark.slow
+
 TARGET = np.array([0.0, 0.0, 3.0])
 
 

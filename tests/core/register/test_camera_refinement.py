@@ -105,6 +105,7 @@ def test_four_sharp_markers_hold_the_camera_and_the_specimen_agrees(
     assert 0.001 < found.after_mm < 2 * refined.lateral_sd_mm
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ids", [ALL, THREE])
 def test_what_markers_leave_open_the_specimen_settles(caster: RayCaster, picture: Image, ids: tuple[int, ...]) -> None:
     cases = [found for seed in SEEDS if (found := case(picture, caster, ids, BLURRED_PX, seed)).refined.specimen_used]
@@ -134,6 +135,7 @@ def test_what_nothing_settles_is_said(caster: RayCaster, picture: Image) -> None
         assert f"{found.refined.lateral_sd_mm:.1f} mm" in found.refined.warnings()[0].message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_moved_specimen_does_not_draw_the_camera_along(caster: RayCaster, seed: int) -> None:
     image = seen(moved_by(caster.mesh, turned(0.0, np.array(MOVED_MM))))
@@ -174,6 +176,7 @@ def resolved(folder: Path) -> tuple[float, float, RefinedCamera]:
     return off(alone), off(refined.camera), refined
 
 
+@pytest.mark.slow
 def test_a_run_with_two_markers_in_the_cube_is_settled(finished: Finished, small: OnDisk, tmp_path: Path) -> None:
     report = rerun(finished, small, tmp_path, LARGER, (1, 3))
     assert report.marker_ids_in_cube == [0, 2]
@@ -216,6 +219,7 @@ def blurred(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Report]:
     return folder, run_pipeline(Inputs(phantom.photos, phantom.header), folder / "out", PipelineSettings())
 
 
+@pytest.mark.slow
 def test_a_run_on_blurred_photos_is_settled(blurred: tuple[Path, Report]) -> None:
     folder, report = blurred
     assert len(report.marker_ids_in_cube) == 3

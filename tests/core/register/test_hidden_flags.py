@@ -24,6 +24,8 @@ from specimap_validation.phantom import Phantom, PhantomSettings, write_cube, wr
 from specimap_validation.phantom.specimen import TRAY_Z_MM
 from tests.support.scenes import xyz_image
 
+pytestmark = pytest.mark.slow
+
 Mask = NDArray[np.bool_]
 SEEDS = (3, 22)
 TILTED_DEG, UPRIGHT_DEG = 12.0, PhantomSettings().hsi_tilt_deg

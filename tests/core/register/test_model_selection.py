@@ -102,6 +102,7 @@ def test_a_marker_left_out_of_a_scan_is_placed_by_the_others(axis: Axis) -> None
     assert np.abs(miss).max() < 0.01
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
     st.floats(0.1, 8.0),
@@ -198,6 +199,7 @@ def plain_mm(finished: Finished, small: OnDisk, tmp_path_factory: pytest.TempPat
     return run_on(CUBES["square"], finished, small, tmp_path_factory.mktemp("plain"))[1].errors.median
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CUBES)
 def test_a_cube_is_registered_by_a_camera_of_its_own_kind(
     finished: Finished, small: OnDisk, tmp_path: Path, plain_mm: float, name: str
@@ -214,6 +216,7 @@ def test_a_cube_is_registered_by_a_camera_of_its_own_kind(
     assert 0.001 < report.methods["camera"].leave_one_marker_out_mm.median < 0.05
 
 
+@pytest.mark.slow
 def test_two_markers_and_the_specimen_tell_a_scan(
     finished: Finished, small: OnDisk, tmp_path: Path, plain_mm: float
 ) -> None:
@@ -224,6 +227,7 @@ def test_two_markers_and_the_specimen_tell_a_scan(
     assert judged.within(2) > 0.88
 
 
+@pytest.mark.slow
 def test_a_specimen_that_moved_in_a_scan_is_noticed(finished: Finished, small: OnDisk, tmp_path: Path) -> None:
     cube = Cube({"cube_scan": "rows", "moved_mm": (1.2, -0.9, 0.0)}, "scan_rows")
     report, judged = run_on(cube, finished, small, tmp_path)

@@ -92,6 +92,7 @@ def test_a_still_specimen_is_left_in_peace(finished: Finished, tmp_path: Path, r
     assert 1e-4 < shift.moved_mm < TOLERANCE_MM
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [
@@ -113,6 +114,7 @@ def test_defects_are_not_taken_for_motion(tmp_path: Path, change: dict[str, obje
     assert moved.moved_mm == pytest.approx(2.0, abs=2 * TOLERANCE_MM)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["phantom_a", "phantom_hard"])
 def test_path_traced_specimens_did_not_move(data_dir: Path, shared_folders: SharedFolders, name: str) -> None:
     run = shared_run(shared_folders, data_dir / name)

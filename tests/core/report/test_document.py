@@ -95,6 +95,7 @@ def test_figures_are_those_of_the_report(folder: Path, page: Page) -> None:
         assert page.row(f"{k}")[1:] == [photo.name, "320 x 240", "0, 7", f"{rms:.3f}"]
 
 
+@pytest.mark.slow
 def test_hostile_names_are_text(tmp_path: Path) -> None:
     points = scene(70, 53)
     report = full_report(len(points), (HOSTILE, "b.jpg", "ç" * 200))
@@ -137,6 +138,7 @@ def test_without_the_photos_their_outlines_stay(tmp_path: Path, sheet: bytes | N
     assert len(page.images) == 10
 
 
+@pytest.mark.slow
 def test_the_same_run_gives_the_same_bytes(folder: Path, tmp_path: Path) -> None:
     for format in ("html", "pdf"):
         first, second = (write_document(folder, tmp_path / f"{k}.{format}", format) for k in range(2))
@@ -161,6 +163,7 @@ def test_a_stop_leaves_nothing(folder: Path, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_exports_of_the_core_are_the_same(folder: Path, page: Page, tmp_path: Path) -> None:
     cloud = Cloud.open(folder / "cloud.zarr")
     assert export_cloud(cloud, tmp_path / "r.html", "html").read_text(encoding="utf-8") == page.text
@@ -174,6 +177,7 @@ def test_exports_of_the_core_are_the_same(folder: Path, page: Page, tmp_path: Pa
         (tmp_path / "bare" / "cloud.zarr").rename(folder / "cloud.zarr")
 
 
+@pytest.mark.slow
 def test_what_is_refused(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(NotFoundError, match="no report"):
         write_document(tmp_path, tmp_path / "r.html", "html")
@@ -212,6 +216,7 @@ def test_hardly_any_points(tmp_path: Path, count: int) -> None:
     assert len(page_of(folder_of(tmp_path / "out", None, few)).images) == 10
 
 
+@pytest.mark.slow
 def test_a_photo_without_markers(tmp_path: Path) -> None:
     report = full_report(10)
     bare = [

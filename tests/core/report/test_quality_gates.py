@@ -166,6 +166,7 @@ def ran(photos: Path, cube: Path, out: Path) -> Report:
     return Report.model_validate(answer.events[-1]["report"])
 
 
+@pytest.mark.slow
 def test_a_card_that_moved_in_one_photo_is_named(small: OnDisk, tmp_path: Path) -> None:
     photos = copied(small.photos, tmp_path / "photos")
     (name,) = card_moved(small, photos, marker=2, by_mm=(2.0, 0.0), photos=slice(0, 1))
@@ -178,12 +179,14 @@ def test_a_card_that_moved_in_one_photo_is_named(small: OnDisk, tmp_path: Path) 
     assert found.corner_2d_mm.mean < 0.1
 
 
+@pytest.mark.slow
 def test_a_card_that_moved_between_photos_is_said(small: OnDisk, tmp_path: Path) -> None:
     photos = copied(small.photos, tmp_path / "photos")
     card_moved(small, photos, marker=2, by_mm=(2.0, 0.0), photos=slice(0, 6))
     assert "corners_scatter" in codes(ran(photos, small.header, tmp_path / "out"))
 
 
+@pytest.mark.slow
 def test_a_card_that_moved_far_between_photos_is_refused(small: OnDisk, tmp_path: Path) -> None:
     photos = copied(small.photos, tmp_path / "photos")
     card_moved(small, photos, marker=2, by_mm=(5.0, 3.0), photos=slice(0, 6))
@@ -194,6 +197,7 @@ def test_a_card_that_moved_far_between_photos_is_refused(small: OnDisk, tmp_path
     assert not (out / "report.json").exists()
 
 
+@pytest.mark.slow
 def test_photos_from_one_side_are_said_to_leave_holes(small: OnDisk, tmp_path: Path) -> None:
     photos = copied(small.photos, tmp_path / "photos")
     for path in sorted(photos.iterdir())[6:]:
@@ -201,6 +205,7 @@ def test_photos_from_one_side_are_said_to_leave_holes(small: OnDisk, tmp_path: P
     assert "coverage_low" in codes(ran(photos, small.header, tmp_path / "out"))
 
 
+@pytest.mark.slow
 def test_the_cube_of_another_layout_is_refused(
     small: OnDisk, other: OnDisk, finished: Finished, tmp_path: Path
 ) -> None:
@@ -210,6 +215,7 @@ def test_the_cube_of_another_layout_is_refused(
     assert "elsewhere in the cube than in the photos" in str(refusal["message"])
 
 
+@pytest.mark.slow
 def test_a_photo_of_elsewhere_is_left_out_and_nothing_else_said(small: OnDisk, other: OnDisk, tmp_path: Path) -> None:
     photos = copied(small.photos, tmp_path / "photos")
     shutil.copy(other.photos / "view_004.jpg", photos / "elsewhere.jpg")

@@ -15,6 +15,8 @@ from specimap_core.surface.regions import worth_refining
 from specimap_core.surface.uncertainty import LEAST_SIGMA_MM
 from tests.support.matched_scene import Matched, matched
 
+pytestmark = pytest.mark.slow
+
 SEEDS = (31, 32)
 SETTINGS = RefineSettings()
 FIRST = replace(SETTINGS, passes=SETTINGS.passes[:1])

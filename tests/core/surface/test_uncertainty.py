@@ -28,6 +28,8 @@ from specimap_core.surface.uncertainty import (
 )
 from tests.support.matched_scene import matched
 
+pytestmark = pytest.mark.slow
+
 Singles = NDArray[np.float32]
 SHAPE = (24, 30)
 SEED = 31
