@@ -13,7 +13,13 @@ from typing import Annotated
 import typer
 
 from specimap_cli.progress import Listener
-from specimap_core.errors import CancelledError, MemoryExhaustedError, SpecimapError, StageFailedError
+from specimap_core.errors import (
+    BackendUnavailableError,
+    CancelledError,
+    MemoryExhaustedError,
+    SpecimapError,
+    StageFailedError,
+)
 
 REFUSED = 2
 """Exit status of a refused input."""
@@ -21,6 +27,11 @@ FAILED = 1
 """Exit status where the program itself failed: an unforeseen error."""
 STOPPED = 130
 DEBUG_VARIABLE = "SPECIMAP_DEBUG"
+EXTRAS = (
+    "Install specimap[pipeline] for runs, reports and validation, specimap[service] for keys and the API, and "
+    "specimap[service,workers] for serve and worker."
+)
+"""The advice where a package is absent: `pip install specimap` alone reads and exports results."""
 
 Debug = Annotated[
     bool, typer.Option("--debug", envvar=DEBUG_VARIABLE, help="Print the traceback of an unforeseen error.")
@@ -64,6 +75,15 @@ def reported_errors(listener: Listener, debug: bool) -> Iterator[None]:
         # The reader of the output has closed it; Python would report that again when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise typer.Exit(FAILED) from None
+    except ModuleNotFoundError as error:
+        if debug:
+            traceback.print_exc()
+        listener.refused(
+            BackendUnavailableError(
+                f"This command needs {error.name}, which is not installed.", advice=EXTRAS, module=error.name
+            )
+        )
+        raise typer.Exit(REFUSED) from None
     except Exception as error:
         if debug:
             traceback.print_exc()
