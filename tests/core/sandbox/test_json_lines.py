@@ -105,12 +105,19 @@ def test_a_line_that_is_no_object_is_refused_and_the_next_one_counts(text: str) 
         assert process.receive(PATIENCE_SECONDS) == {"fine": 1}
 
 
-def test_an_endless_line_is_refused_and_takes_no_memory() -> None:
+def test_a_line_beyond_the_limit_is_refused_before_it_ends() -> None:
+    with start(f"os.write(1, b'x' * {LINE_LIMIT + 1}); time.sleep(600)") as process:
+        with pytest.raises(InvalidMessageError, match="longer"):
+            process.receive(PATIENCE_SECONDS)
+        with pytest.raises(TimeoutError):
+            process.receive(0)
+
+
+def test_an_endless_line_is_refused_piece_by_piece() -> None:
     with start("while True: os.write(1, b'x' * 65536)") as process:
         for _ in range(20):
             with pytest.raises(InvalidMessageError, match="longer"):
                 process.receive(PATIENCE_SECONDS)
-            assert len(process._received) <= LINE_LIMIT + 65536
 
 
 def test_the_longest_line_is_taken() -> None:
@@ -183,6 +190,7 @@ def test_a_flood_of_errors_holds_nothing_up_and_its_last_lines_are_kept() -> Non
     )
     with start(program) as process:
         assert process.receive(60) == {"done": True}
+        assert len(process._recent) <= TAIL_LINES * TAIL_LINE_LENGTH
         with pytest.raises(ProcessEndedError) as caught:
             process.receive(PATIENCE_SECONDS)
     tail = caught.value.tail
@@ -204,8 +212,9 @@ def test_what_is_printed_goes_to_the_log_and_messages_to_a_pipe_of_their_own(tmp
 
 
 def test_the_tail_of_a_closed_process_stays() -> None:
-    with start("print('the last words', file=sys.stderr); print('{}', flush=True); time.sleep(600)") as process:
-        process.receive(PATIENCE_SECONDS)
+    with start("print('the last words', file=sys.stderr)") as process:
+        while process.alive:
+            time.sleep(0.01)
     assert process.tail() == ["the last words"]
 
 
