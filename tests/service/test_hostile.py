@@ -7,7 +7,9 @@ import json
 import struct
 import sys
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -121,28 +123,53 @@ def shows_secret(file: dict[str, Any]) -> bool:
     return any(f"{value:g}" in text for value in SECRET_NM)
 
 
+@dataclass(frozen=True)
+class Beside:
+    """A service in a folder, and beside it the secrets by the kind of file that leads to them."""
+
+    folder: Path
+    service: Running
+    secrets: dict[str, Path]
+
+
+@contextmanager
+def beside_secrets(folder: Path, sandbox: str) -> Iterator[Beside]:
+    with serving(folder / "service", own_judge=True, sandbox=sandbox) as service:
+        yield Beside(folder, service, secrets_in(folder / "elsewhere"))
+
+
+@pytest.fixture(scope="module")
+def usual(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Beside]:
+    """Files are judged as usual."""
+    with beside_secrets(tmp_path_factory.mktemp("usual"), "best-effort") as made:
+        yield made
+
+
+@pytest.fixture(scope="module", params=["require", "off"])
+def naive(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Beside]:
+    """Files are judged by readers without a guard, confined or not."""
+    with beside_secrets(tmp_path_factory.mktemp("naive"), request.param) as made:
+        judge: Judge = made.service.app.state.judge
+        judge._command = (sys.executable, "-c", NAIVE, *judge._command[3:])
+        yield made
+
+
 @pytest.mark.parametrize("relative", [False, True])
 @pytest.mark.parametrize("kind", HOSTILE)
-def test_a_file_that_leads_elsewhere_tells_nothing(kind: str, relative: bool, tmp_path: Path) -> None:
-    secret = secrets_in(tmp_path / "elsewhere")[kind]
-    # A judged file lies four folders below the test's own.
+def test_a_file_that_leads_elsewhere_tells_nothing(kind: str, relative: bool, usual: Beside, tmp_path: Path) -> None:
+    secret = usual.secrets[kind]
+    # A judged file lies four folders below that of the service and the secrets.
     place = f"../../../../elsewhere/{secret.name}" if relative else str(secret)
     data = HOSTILE[kind](place, tmp_path)
-    name = "x.tif" if kind == "ome" else "x.h5"
-    with serving(tmp_path / "service", own_judge=True) as service:
-        assert not shows_secret(uploaded(service, data, name))
+    assert not shows_secret(uploaded(usual.service, data, "x.tif" if kind == "ome" else "x.h5"))
 
 
 @pytest.mark.skipif(not protection().whole, reason="this kernel does not confine")
-@pytest.mark.parametrize("sandbox", ["require", "off"])
 @pytest.mark.parametrize("kind", HOSTILE)
-def test_confinement_holds_alone_where_a_reader_would_follow(kind: str, sandbox: str, tmp_path: Path) -> None:
-    secret = secrets_in(tmp_path / "elsewhere")[kind]
-    data = HOSTILE[kind](str(secret), tmp_path)
-    with serving(tmp_path / "service", sandbox=sandbox, own_judge=True) as service:
-        judge: Judge = service.app.state.judge
-        judge._command = (sys.executable, "-c", NAIVE, *judge._command[3:])
-        file = uploaded(service, data, "x.tif" if kind == "ome" else "x.h5")
+def test_confinement_holds_alone_where_a_reader_would_follow(kind: str, naive: Beside, tmp_path: Path) -> None:
+    sandbox = naive.service.settings.sandbox
+    data = HOSTILE[kind](str(naive.secrets[kind]), tmp_path)
+    file = uploaded(naive.service, data, "x.tif" if kind == "ome" else "x.h5")
     # Without it the reader follows, which shows that the file is what it should be.
     assert shows_secret(file) == (sandbox == "off" and (kind != "ome" or _follows(data, tmp_path)))
     if sandbox == "require" and kind in ("external", "linked"):  # of the others a library makes up values
@@ -163,21 +190,21 @@ def npz(members: dict[str, bytes]) -> bytes:
     return out.getvalue()
 
 
-def test_other_formats_that_name_paths_write_and_tell_nothing(tmp_path: Path) -> None:
-    secret = secrets_in(tmp_path / "elsewhere")["external"]
+def test_other_formats_that_name_paths_write_and_tell_nothing(usual: Beside) -> None:
+    secret = usual.secrets["external"]
     value = io.BytesIO()
     np.save(value, CUBE)
     link = zipfile.ZipInfo("cube.npy")
     link.external_attr = 0o120777 << 16
     pickled = io.BytesIO()
-    np.save(pickled, np.array([Opener(str(tmp_path / "made"))], object), allow_pickle=True)
+    np.save(pickled, np.array([Opener(str(usual.folder / "made"))], object), allow_pickle=True)
     header = (
         f"ENVI\nsamples = 5\nlines = 6\nbands = 4\ndata type = 12\ninterleave = bsq\nbyte order = 0\n"
         f"header offset = 0\ndata file = {secret}\nwavelength = {{{secret}}}\n"
     )
     files = {
         "slip.npz": npz({"../../../../made.npy": value.getvalue()}),
-        "absolute.npz": npz({f"{tmp_path}/made": b"x"}),
+        "absolute.npz": npz({f"{usual.folder}/made": b"x"}),
         "pickle.npy": pickled.getvalue(),
         "named.hdr": header.encode(),
     }
@@ -185,12 +212,11 @@ def test_other_formats_that_name_paths_write_and_tell_nothing(tmp_path: Path) ->
     with zipfile.ZipFile(out, "w") as archive:
         archive.writestr(link, str(secret))
     files["link.npz"] = out.getvalue()
-    with serving(tmp_path / "service", own_judge=True) as service:
-        for name, data in files.items():
-            file = uploaded(service, data, name)
-            assert not shows_secret(file), name
-            assert SECRET.hex() not in json.dumps(file)
-    assert not list(tmp_path.glob("made*"))
+    for name, data in files.items():
+        file = uploaded(usual.service, data, name)
+        assert not shows_secret(file), name
+        assert SECRET.hex() not in json.dumps(file)
+    assert not list(usual.folder.glob("made*"))
 
 
 class Opener:
@@ -203,8 +229,8 @@ class Opener:
         return open, (self._path, "w")
 
 
-def test_photos_that_are_not_what_they_seem_tell_nothing(tmp_path: Path) -> None:
-    secret = secrets_in(tmp_path / "elsewhere")["external"]
+def test_photos_that_are_not_what_they_seem_tell_nothing(usual: Beside, tmp_path: Path) -> None:
+    secret = usual.secrets["external"]
     beyond = struct.pack("<2sHIHHHII", b"II", 42, 8, 1, 273, 4, 1, 2**31) + bytes(4)
     files = {
         "offset.tif": beyond,
@@ -213,12 +239,11 @@ def test_photos_that_are_not_what_they_seem_tell_nothing(tmp_path: Path) -> None
         "a.eps": f"%!PS-Adobe-3.0 EPSF-3.0\n({secret}) (r) file\n".encode(),
         "a.fpx": bytes.fromhex("d0cf11e0a1b11ae1") * 100,
     }
-    with serving(tmp_path / "service", own_judge=True) as service:
-        client = service.client(("upload", "read"))
-        acquisition = new_acquisition(client)
-        for name, data in files.items():
-            assert not shows_secret(sent(client, acquisition, "photo", name, data)), name
-        assert sent(client, acquisition, "photo", "good.jpg", photos()[0].read_bytes())["state"] == "accepted"
+    client = usual.service.client(("upload", "read"))
+    acquisition = new_acquisition(client)
+    for name, data in files.items():
+        assert not shows_secret(sent(client, acquisition, "photo", name, data)), name
+    assert sent(client, acquisition, "photo", "good.jpg", photos()[0].read_bytes())["state"] == "accepted"
 
 
 def test_a_key_for_uploads_reads_no_database(service: Running) -> None:

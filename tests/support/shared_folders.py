@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import os
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,9 +29,8 @@ class SharedFolders:
         with open(self.root / f"{folder.name}.lock", "w", encoding="ascii") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if not folder.exists():
-                # A process that failed may have left a part.
-                unfinished = self.root / f"{folder.name}.{os.getpid()}"
-                unfinished.mkdir()
+                # Whoever fails leaves a part of it.
+                unfinished = Path(tempfile.mkdtemp(prefix=f"{folder.name}.", dir=self.root))
                 make(unfinished)
                 unfinished.rename(folder)
         return folder
