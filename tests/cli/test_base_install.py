@@ -15,14 +15,13 @@ from tests.support.scenes import Finished
 
 BARE = """
 import sys
-
-class Absent:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in ABSENT:
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+from importlib.machinery import PathFinder
 
 ABSENT = set(sys.argv.pop(1).split(","))
-sys.meta_path.insert(0, Absent())
+found = PathFinder.find_spec
+PathFinder.find_spec = lambda name, path=None, target=None: (
+    None if name.partition(".")[0] in ABSENT else found(name, path, target)
+)
 from specimap_cli import main
 main()
 """
