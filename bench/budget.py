@@ -14,7 +14,8 @@ from scipy.ndimage import map_coordinates
 
 from bench.sample import SAMPLE
 from bench.scene import Scene, scaled_maps
-from specimap_core.geometry.cameras import Floats, Pose, View, fit_similarity
+from specimap_core.arrays import Floats
+from specimap_core.geometry.cameras import Pose, View, fit_similarity
 from specimap_core.photos.folder import photo_paths
 from specimap_core.photos.reading import read_photos
 from specimap_core.pipeline.clock import Clock

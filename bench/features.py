@@ -11,13 +11,14 @@ import numpy as np
 from rich.console import Console
 
 from bench.service.sheet import NONE, Sheet
+from specimap_core.arrays import Floats
 from specimap_core.errors import SpecimapError
-from specimap_core.geometry.cameras import Floats, Pose, fit_similarity
+from specimap_core.geometry.cameras import Pose, fit_similarity
 from specimap_core.photos.folder import photo_paths
 from specimap_core.photos.reading import AcquisitionSettings, Photo, read_photos
 from specimap_core.reconstruct.backend import CornersInPhotos, ReconstructSettings, corners_in_photos, detect_in_photos
-from specimap_core.reconstruct.dense.depth_map import DepthSettings
 from specimap_core.reconstruct.dense.multi_view import dense_depth
+from specimap_core.reconstruct.dense.settings import DepthSettings
 from specimap_core.reconstruct.dense.volume import volume_over
 from specimap_core.reconstruct.features.choice import aliked_missing
 from specimap_core.reconstruct.poses import Posed, pose_photos

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Floats
 from specimap_core.cube import open_cube
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, View, fit_similarity
+from specimap_core.geometry.cameras import Intrinsics, Pose, View, fit_similarity
+from specimap_core.geometry.depth_map import DepthMap
 from specimap_core.pipeline.artefacts import Stage1, Stage2
 from specimap_core.pipeline.settings import PipelineSettings
-from specimap_core.reconstruct.dense.depth_map import DepthMap
 from specimap_core.register.camera_refinement import refine_camera
 from specimap_core.register.corners import CornersInCube, corners_in_cube
 from specimap_core.register.cube_markers import find_markers

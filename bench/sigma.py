@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 
 from bench.scene import Scene, scaled_maps
 from bench.service.sheet import Sheet
-from specimap_core.geometry.cameras import Floats
+from specimap_core.arrays import Floats
 from specimap_core.photos.folder import photo_paths
 from specimap_core.pipeline.clock import Clock
 from specimap_core.pipeline.outputs import Outputs

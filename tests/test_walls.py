@@ -29,6 +29,13 @@ MAY_IMPORT = {
     "cli": {"core", "infra", "workers", "service", "validation", "cli", "client"},
     "validation": {"core", "validation"},
 }
+CORE_ORDER = (
+    *("errors", "arrays", "notices", "threads", "progress", "json_text", "atomic", "native"),
+    *("geometry", "sandbox", "photos", "fiducials", "cube"),
+    *("bundle_adjust", "surface", "render", "cloud", "reconstruct", "register"),
+    *("truth", "report", "export", "screening", "pipeline"),
+)
+"""Modules and packages of core: each imports those before it alone."""
 FEATURE_IMPORTS = {
     "auth": set(),
     "clouds": {"auth"},
@@ -106,6 +113,19 @@ def test_only_the_service_knows_http_statuses(folder: str) -> None:
     for path in modules(folder):
         roots = {name.split(".")[0] for name in imported(path.read_text("utf-8"))}
         assert not roots & {"fastapi", "starlette", "http"}, path.relative_to(ROOT)
+
+
+def test_packages_of_core_import_those_before_them() -> None:
+    wrong = []
+    for path in modules("core"):
+        own = path.relative_to(ROOT / "core" / "specimap_core").with_suffix("").parts[0]
+        if own == "__init__":
+            continue
+        names = {name.split(".")[1] for name in imported(path.read_text("utf-8")) if name.startswith("specimap_core.")}
+        later = set(CORE_ORDER[CORE_ORDER.index(own) + 1 :])
+        wrong += [f"{path.relative_to(ROOT)} imports {name}" for name in sorted(names & later)]
+        assert names - {"__version__"} <= set(CORE_ORDER)
+    assert wrong == []
 
 
 def test_no_module_imports_open3d() -> None:

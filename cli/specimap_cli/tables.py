@@ -6,7 +6,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from specimap_core.report.model import LeaveOneOut, Report
+from specimap_core.register.figures import LeaveOneOut
+from specimap_core.report.model import Report
 
 PUBLISHED = {"2d": "0.013-0.017", "3d": "0.945-0.974"}
 

@@ -1,14 +1,11 @@
 """The science: four stages, formats, geometry, accuracy. No web, no queue, no database, no HTTP status.
 
-Packages, bottom to top; a package imports only from those above it in this list and from its own row::
+Modules and packages from the bottom up; each imports only those before it::
 
-    errors, atomic, native, threads, progress, json_text
-    geometry, sandbox
-    photos, fiducials, cube
-    bundle_adjust, surface, render, cloud
-    reconstruct, register
-    truth, report, export, screening
-    pipeline
+    errors, arrays, notices, threads, progress, json_text, atomic, native
+    geometry, sandbox, photos, fiducials, cube
+    bundle_adjust, surface, render, cloud, reconstruct, register
+    truth, report, export, screening, pipeline
 """
 
 from importlib.metadata import version

@@ -13,7 +13,7 @@ import pyarrow as pa
 from fastapi import Request
 from starlette.responses import Response, StreamingResponse
 
-from specimap_core.geometry.cameras import Array
+from specimap_core.arrays import Array
 from specimap_service.errors import NotAcceptableError
 
 JSON = "application/json"

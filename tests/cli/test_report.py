@@ -14,7 +14,7 @@ import typer
 from typer.testing import CliRunner
 
 from specimap_cli.report import report as report_command
-from specimap_core.geometry.cameras import Floats
+from specimap_core.arrays import Floats
 from specimap_core.photos.contact_sheet import read_tiles
 from specimap_core.pipeline.outputs import Outputs
 from specimap_core.report.model import PhotoCorners, Report

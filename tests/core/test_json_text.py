@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from specimap_cli.progress import json_listener
 from specimap_core.json_text import json_log_line, json_ready, json_text
 from specimap_core.pipeline.outputs import Outputs
-from specimap_core.report.model import Report, Spread, read_report
+from specimap_core.register.figures import Spread
+from specimap_core.report.model import Report, read_report
 from tests.support.document_scene import folder_of, full_report
 from tests.support.places import ROOT
 from tests.support.scenes import specimap

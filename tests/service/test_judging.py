@@ -16,8 +16,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from specimap_core.arrays import Bytes
 from specimap_core.errors import BackendUnavailableError
 from specimap_core.photos.reading import AcquisitionSettings, read_photo
 from specimap_core.pipeline.options import Dictionary
@@ -29,25 +29,24 @@ from tests.support.photo_files import bomb
 from tests.support.service_scene import Running
 from tests.support.upload_scene import client_at, key_in, new_acquisition, photos, process_serving, send, sent
 
-Image = NDArray[np.uint8]
 SHARP = photos()
 
 
-def jpeg(image: Image) -> bytes:
+def jpeg(image: Bytes) -> bytes:
     ok, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 92])
     assert ok
     return data.tobytes()
 
 
-def bgr(path: Path) -> Image:
+def bgr(path: Path) -> Bytes:
     return np.asarray(cv2.imread(str(path)), np.uint8)
 
 
-def defocused(image: Image, sigma: float) -> Image:
+def defocused(image: Bytes, sigma: float) -> Bytes:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), np.uint8)
 
 
-def shaken(image: Image, pixels: int, degrees: float) -> Image:
+def shaken(image: Bytes, pixels: int, degrees: float) -> Bytes:
     line = np.zeros((pixels, pixels), np.float32)
     line[pixels // 2] = 1
     turn = cv2.getRotationMatrix2D(((pixels - 1) / 2, (pixels - 1) / 2), degrees, 1)

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats, View
+from specimap_core.arrays import Floats
+from specimap_core.geometry.cameras import View
 from tests.support.scenes import OnDisk
 
 TRAY_GREY = (120, 120, 120)

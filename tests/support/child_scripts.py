@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from specimap_core.geometry.cameras import Array
+from specimap_core.arrays import Array
 from specimap_core.sandbox.process import Answer, run_child
 
 STEPS = {"first": 1.0, "second": 3.0}

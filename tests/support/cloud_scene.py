@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Array
 from specimap_core.cloud import CloudPoints
-from specimap_core.geometry.cameras import Array
 
 
 @dataclass(eq=False)

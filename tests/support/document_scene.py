@@ -14,7 +14,8 @@ from specimap_core.cloud import Cloud, CloudPoints
 from specimap_core.cloud.preview import write_preview
 from specimap_core.cloud.writer import write_cloud
 from specimap_core.photos.contact_sheet import contact_sheet
-from specimap_core.report.model import CubeCorners, LeaveOneOut, MethodFigures, PhotoCorners, Report
+from specimap_core.register.figures import LeaveOneOut, MethodFigures
+from specimap_core.report.model import CubeCorners, PhotoCorners, Report
 from tests.support.cloud_scene import FakeCube, counts, scene
 from tests.support.result_scene import report_of
 

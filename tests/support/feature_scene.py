@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats, Pose, View, fit_similarity, skew
+from specimap_core.arrays import Floats
+from specimap_core.geometry.cameras import Pose, View, fit_similarity, skew
 from specimap_core.photos.reading import Photo, sharpness_of
 from specimap_core.reconstruct.backend import CornersInPhotos, corners_in_photos, detect_in_photos
 from specimap_validation.phantom import PhantomSettings

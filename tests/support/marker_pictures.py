@@ -6,11 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Bytes, Floats
 from specimap_core.fiducials.detection import dictionary_named
-from specimap_core.geometry.cameras import Floats
 from specimap_core.photos.colour import srgb_from_linear
-
-Bytes = NDArray[np.uint8]
 
 
 def picture(

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Array, Floats
 from specimap_core.bundle_adjust.adjust import AdjustSettings, Form, adjust
-from specimap_core.geometry.cameras import Array, Floats, Intrinsics, Pose, View, fit_similarity
+from specimap_core.geometry.cameras import Intrinsics, Pose, View, fit_similarity
 from specimap_core.photos.folder import photo_paths
 from specimap_core.photos.reading import AcquisitionSettings, Photo, read_photos
 from specimap_core.reconstruct.backend import (

@@ -9,9 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
-from specimap_core.reconstruct.dense.depth_map import Bytes, DepthMap, DepthSettings
+from specimap_core.arrays import Bytes, Floats
+from specimap_core.geometry.cameras import Intrinsics, Pose
+from specimap_core.geometry.depth_map import DepthMap
 from specimap_core.reconstruct.dense.multi_view import dense_depth
+from specimap_core.reconstruct.dense.settings import DepthSettings
 from specimap_core.reconstruct.dense.volume import Volume, volume_over
 from specimap_core.surface.fusion import Mesh, SurfaceSettings, fuse
 from specimap_core.surface.refinement import pixel_footprint_mm

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, View, look_at, rotation_from_vector
+from specimap_core.arrays import Floats
+from specimap_core.geometry.cameras import Intrinsics, Pose, View, look_at, rotation_from_vector
 from specimap_core.pipeline.artefacts import Stage2, load_stage2
 from specimap_core.pipeline.outputs import Outputs
 from specimap_core.surface.fusion import Mesh, vertex_normals

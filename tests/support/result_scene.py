@@ -9,24 +9,22 @@ from pathlib import Path
 import numpy as np
 import sqlalchemy as sa
 
+from specimap_core.arrays import Array
 from specimap_core.cloud import Cloud, CloudPoints
 from specimap_core.cloud.labels import write_label
 from specimap_core.cloud.preview import write_preview
 from specimap_core.cloud.writer import write_cloud
-from specimap_core.geometry.cameras import Array
+from specimap_core.register.figures import MethodFigures, Quartiles, Spread
 from specimap_core.report.model import (
     Coverage,
     CubeCameraFigures,
     EdgeLength,
     Inliers,
-    MethodFigures,
     Parallax,
     Photos,
-    Quartiles,
     Report,
     Reprojection,
     SigmaFigures,
-    Spread,
 )
 from specimap_core.surface.fusion import Mesh
 from specimap_core.surface.mesh_files import write_mesh_ply

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from specimap_cli.app import app
+from specimap_core.arrays import Array, Floats
 from specimap_core.bundle_adjust.solver import MarkerScene
 from specimap_core.cloud import Cloud
 from specimap_core.errors import StageFailedError
 from specimap_core.fiducials.observations import Observations, corners_of
-from specimap_core.geometry.cameras import Array, Floats, Intrinsics, Pose, look_at, rotation_from_vector
+from specimap_core.geometry.cameras import Intrinsics, Pose, look_at, rotation_from_vector
 from specimap_core.pipeline.outputs import Inputs
 from specimap_core.pipeline.run import run_pipeline
 from specimap_core.pipeline.settings import PipelineSettings

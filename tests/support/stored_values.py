@@ -9,10 +9,10 @@ import xarray
 import zarr
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Floats
 from specimap_core.cloud import Cloud, Flag
 from specimap_core.cloud.writer import write_cloud
 from specimap_core.cube import Cube, inspect
-from specimap_core.geometry.cameras import Floats
 from tests.support.cloud_scene import scene
 from tests.support.cube_files import Values
 from tests.support.value_files import WRITERS

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from specimap_core.report.model import Quartiles, Spread
+from specimap_core.register.figures import Quartiles, Spread
 from specimap_validation.runs import AgainstTruth, Figures, Outcome, Refusal
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.io
 import tifffile
 
-from specimap_core.geometry.cameras import Floats
+from specimap_core.arrays import Floats
 from tests.support.cube_files import Values, write_envi
 
 NM = np.linspace(400.0, 900.0, 6)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats, Intrinsics, View, look_at
+from specimap_core.arrays import Floats
+from specimap_core.geometry.cameras import Intrinsics, View, look_at
 from specimap_validation.phantom import MATERIALS, Paint, Phantom, load_truth, render_view
 from specimap_validation.phantom.materials import BLACK_INK
 from tests.support.scenes import SMALL

@@ -26,7 +26,8 @@ from specimap_core.pipeline.clock import Progress
 from specimap_core.pipeline.outputs import Inputs
 from specimap_core.pipeline.run import run_pipeline
 from specimap_core.pipeline.settings import PipelineSettings
-from specimap_core.report.model import Quartiles, Report, Section, Spread
+from specimap_core.register.figures import Quartiles, Section, Spread
+from specimap_core.report.model import Report
 from specimap_core.truth.judge import judge_with_sigma
 
 REFUSED = (

@@ -17,7 +17,7 @@ from specimap_core.pipeline.keys import register_key, surface_keys
 from specimap_core.pipeline.outputs import Inputs, prepare_folder
 from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.progress import within
-from specimap_core.report.model import Section
+from specimap_core.register.figures import Section
 from specimap_validation.capture import Capture
 from specimap_validation.photo_subsets import random_subset
 from specimap_validation.runs import Outcome, run_and_judge, scratch_in

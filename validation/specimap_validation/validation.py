@@ -19,8 +19,8 @@ from specimap_core.pipeline.artefacts import FORMAT
 from specimap_core.pipeline.outputs import Inputs, prepare_folder
 from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.progress import within
+from specimap_core.register.figures import Section
 from specimap_core.register.placement import Method
-from specimap_core.report.model import Section
 from specimap_validation.capture import Capture, find_capture
 from specimap_validation.cases import Case
 from specimap_validation.phantom import load_truth, write_phantom

@@ -12,13 +12,14 @@ from typing import Literal
 
 import numpy as np
 
+from specimap_core.arrays import Floats
 from specimap_core.bundle_adjust.covariance import corner_covariance
 from specimap_core.bundle_adjust.solver import MarkerScene, rms_px, solve
 from specimap_core.errors import MarkerGeometryError
 from specimap_core.fiducials.layout import edge_lengths, marker_frame, rigid_square
 from specimap_core.fiducials.observations import Observations, corners_of
 from specimap_core.fiducials.triangulation import triangulate
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, fit_similarity
+from specimap_core.geometry.cameras import Intrinsics, Pose, fit_similarity
 
 Form = Literal["rigid", "free"]
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from specimap_core.arrays import Floats
 from specimap_core.bundle_adjust.solver import MarkerScene, SolveInfo
-from specimap_core.geometry.cameras import Floats, skew
+from specimap_core.geometry.cameras import skew
 from specimap_core.geometry.projection import LENS
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats
+from specimap_core.arrays import Floats
 
 LEAST_DAMPING = 1e-12
 """Added to the diagonal, so that an unknown that nothing determines stays where it is."""

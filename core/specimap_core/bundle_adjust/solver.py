@@ -15,9 +15,10 @@ from functools import partial
 
 import numpy as np
 
+from specimap_core.arrays import Floats
 from specimap_core.bundle_adjust.normal_equations import Assembly, damped_step
 from specimap_core.fiducials.observations import Observations, corners_of, square_corners
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, rotation_from_vector, skew
+from specimap_core.geometry.cameras import Intrinsics, Pose, rotation_from_vector, skew
 from specimap_core.geometry.projection import LENS, projection_derivatives
 from specimap_core.geometry.robust import MEDIAN_OF_RAYLEIGH
 

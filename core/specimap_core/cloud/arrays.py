@@ -13,11 +13,11 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Array
 from specimap_core.cloud.schema import ARRAYS
 from specimap_core.cloud.shards import PointArray, damage
 from specimap_core.cloud.source import ByteSource, Folder
 from specimap_core.errors import CloudDamagedError, NotFoundError
-from specimap_core.geometry.cameras import Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Array
 from specimap_core.cloud.saturation import SaturationCheck, band_runs
 from specimap_core.cloud.schema import NO_VALUE, SCALE_FACTOR, TILE, Flag, SpectraSource
 from specimap_core.cloud.value_range import Extent, extent_of
-from specimap_core.geometry.cameras import Array
 
 LARGEST = 65535
 # Blocks of this many spectra stay in the second-level cache between the passes over them.

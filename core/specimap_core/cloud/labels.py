@@ -16,9 +16,9 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, BytesCodec
 
+from specimap_core.arrays import Array
 from specimap_core.cloud.schema import SHARD_POINTS
 from specimap_core.errors import LabelInvalidError
-from specimap_core.geometry.cameras import Array
 from specimap_core.json_text import json_text
 
 Kind = Literal["class", "probability"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Array
+from specimap_core.arrays import Array
 
 _ROW_STEP = 2.0**18
 """Distance between rows in a key; beyond any column, with 18 bits of a double left for its fraction."""

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Array
 from specimap_core.atomic import atomic_path
 from specimap_core.cloud import CHUNK_POINTS, Cloud, Flag
 from specimap_core.cloud.top_view import TopView, extent_mm, top_view
-from specimap_core.geometry.cameras import Array
 
 COLOURS = 3
 STRETCH_PERCENT = (2.0, 98.0)

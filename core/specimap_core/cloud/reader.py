@@ -8,12 +8,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from specimap_core.arrays import Array
 from specimap_core.cloud.arrays import CloudArrays
 from specimap_core.cloud.outline import in_outline
 from specimap_core.cloud.schema import CHUNK_POINTS, TILE, tile_keys
 from specimap_core.cloud.shards import PointArray
 from specimap_core.errors import NotFoundError
-from specimap_core.geometry.cameras import Array
 
 Indices = NDArray[np.intp]
 _NEAREST_BATCH = 16

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Array
 from specimap_core.cloud.schema import SpectraSource
-from specimap_core.geometry.cameras import Array
 
 
 class SaturationCheck:

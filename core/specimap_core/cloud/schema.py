@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Array
+from specimap_core.arrays import Array
 
 TILE = 16
 CHUNK_POINTS = 256

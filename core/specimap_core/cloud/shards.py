@@ -21,9 +21,9 @@ from google_crc32c import value as crc32c
 from numcodecs import blosc  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Array
 from specimap_core.cloud.source import ByteSource, Folder
 from specimap_core.errors import CloudDamagedError, NotFoundError, SpecimapError
-from specimap_core.geometry.cameras import Array
 
 _ENTRY_BYTES, _CHECKSUM_BYTES = 16, 4
 _ABSENT = 2**64 - 1

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from specimap_core.arrays import Array
 from specimap_core.cloud.saturation import band_runs
 from specimap_core.cloud.schema import TILE, SpectraSource
-from specimap_core.geometry.cameras import Array
 
 _SAMPLED = 400_000
 # So few values may be clipped, where keeping them would make all others coarse.

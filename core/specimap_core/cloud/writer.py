@@ -17,12 +17,12 @@ import tensorstore
 from numpy.typing import NDArray
 
 from specimap_core import __version__
+from specimap_core.arrays import Array
 from specimap_core.atomic import atomic_path
 from specimap_core.cloud.encoding import Encoding, EncodingCounts, SpectraEncoder, strips
 from specimap_core.cloud.schema import ARRAYS, SHARD_POINTS, CloudPoints, Flag, SpectraSource, chunk_bounds, tile_order
 from specimap_core.cloud.write_summary import WriteSummary
 from specimap_core.errors import RegistrationError
-from specimap_core.geometry.cameras import Array
 from specimap_core.json_text import json_text
 
 UNITS = {"length": "mm", "wavelength": "nm"}

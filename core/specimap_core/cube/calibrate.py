@@ -13,12 +13,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Array, Floats
 from specimap_core.cube.model import Cube
 from specimap_core.cube.pixels import Pixels
 from specimap_core.cube.strided import to_bip
 from specimap_core.cube.values import QUANTITY_OTHER, implausible, sampled
 from specimap_core.errors import CubeContentError
-from specimap_core.geometry.cameras import Array, Floats
 from specimap_core.notices import Notice, Notices
 
 # Fewer columns x bands of a saturated white than this are dead elements.

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from specimap_core.arrays import Floats
 from specimap_core.errors import CubeHeaderError
-from specimap_core.geometry.cameras import Floats
 from specimap_core.notices import Notice, Notices
 
 _NO_DATA = (

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from specimap_core.arrays import Array
 from specimap_core.cube.envi_header import EnviHeader, is_envi_header, read_header
 from specimap_core.cube.model import Cube, describe
 from specimap_core.cube.npy import refuse_dataset
 from specimap_core.cube.pixels import ArrayPixels
 from specimap_core.cube.unpacked import bytes_of, scratch_array
 from specimap_core.errors import CubeHeaderError, CubeNotFoundError, CubeTruncatedError
-from specimap_core.geometry.cameras import Array
 from specimap_core.notices import Notice, Notices
 
 _HEADER_SUFFIX = ".hdr"

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
+from specimap_core.arrays import Floats
 from specimap_core.cube.declared_values import WORDS, Declared, check_counts, declared_of, plain
 from specimap_core.cube.printable import printable
 from specimap_core.cube.spectral_units import read_unit
 from specimap_core.errors import CubeHeaderError
-from specimap_core.geometry.cameras import Floats
 from specimap_core.notices import Notice, Notices
 
 MAGIC = "ENVI"

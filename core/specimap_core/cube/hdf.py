@@ -12,6 +12,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from specimap_core.arrays import Array, Floats
 from specimap_core.cube.declared_values import WORDS, Declared, declared_of, is_word, plain
 from specimap_core.cube.discover import Variable, choose_cube, choose_wavelengths, cube_axes
 from specimap_core.cube.hdf_guard import as_text, guarded_dataset, open_guarded
@@ -21,7 +22,6 @@ from specimap_core.cube.printable import printable
 from specimap_core.cube.strided import native
 from specimap_core.cube.unpacked import scratch_array
 from specimap_core.errors import CubeContentError, CubeTruncatedError
-from specimap_core.geometry.cameras import Array, Floats
 
 # A larger row of chunks is not kept decoded while it is read by rows: the cube is unpacked once instead.
 _LARGEST_CHUNK_ROW = 512 << 20

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Array
 from specimap_core.cube.model import Cube
 from specimap_core.cube.outliers import saturated_share
 from specimap_core.cube.pixels import sampled_rows
 from specimap_core.errors import CubeContentError
-from specimap_core.geometry.cameras import Array
 from specimap_core.notices import Notice, Notices
 
 _SAMPLED_ROWS = 24

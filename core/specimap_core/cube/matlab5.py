@@ -14,6 +14,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from specimap_core.arrays import Array
 from specimap_core.cube.declared_values import declared_of, is_word
 from specimap_core.cube.discover import arrays_beside, choose_cube, choose_wavelengths, cube_axes
 from specimap_core.cube.matlab5_elements import COMPRESSED, HEADER_BYTES, MATRIX, Inflated, Parser, Plain, StoredArray
@@ -22,7 +23,6 @@ from specimap_core.cube.npy import starts_with
 from specimap_core.cube.pixels import ArrayPixels
 from specimap_core.cube.unpacked import bytes_of, scratch_array
 from specimap_core.errors import CubeTruncatedError
-from specimap_core.geometry.cameras import Array
 
 _MAGIC = b"MATLAB 5.0 MAT-file"
 _PIECE = 8 << 20

@@ -12,12 +12,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Array, Floats
 from specimap_core.cube.declared_values import Declared
 from specimap_core.cube.pixels import Pixels, read_bip, workers
 from specimap_core.cube.values import Quantity, interpret
 from specimap_core.cube.wavelengths import bad_band_mask, nanometres
 from specimap_core.errors import CubeHeaderError
-from specimap_core.geometry.cameras import Array, Floats
 from specimap_core.notices import Notices
 
 _HASH_CHUNK = 16 << 20

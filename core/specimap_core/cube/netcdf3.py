@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from scipy.io import netcdf_file
 
+from specimap_core.arrays import Array, Floats
 from specimap_core.cube.declared_values import Declared, declared_of
 from specimap_core.cube.discover import Variable, choose_cube, choose_wavelengths, cube_axes
 from specimap_core.cube.model import Cube, describe
 from specimap_core.cube.npy import starts_with
 from specimap_core.cube.pixels import ArrayPixels
-from specimap_core.geometry.cameras import Array, Floats
 
 _LONGEST_UNITS = 64
 _NETCDF3_MAGIC = (b"CDF\x01", b"CDF\x02")

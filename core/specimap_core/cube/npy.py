@@ -10,6 +10,7 @@ from typing import IO
 
 import numpy as np
 
+from specimap_core.arrays import Array, Floats
 from specimap_core.cube.declared_values import declared_of, is_word
 from specimap_core.cube.discover import Variable, arrays_beside, choose_cube, choose_wavelengths, cube_axes
 from specimap_core.cube.model import Cube, check_dtype, describe
@@ -17,7 +18,6 @@ from specimap_core.cube.pixels import ArrayPixels
 from specimap_core.cube.printable import printable
 from specimap_core.cube.unpacked import bytes_of, scratch_array
 from specimap_core.errors import CubeFormatError, CubeTruncatedError
-from specimap_core.geometry.cameras import Array, Floats
 from specimap_core.notices import Notice, Notices
 
 _NPY_MAGIC = b"\x93NUMPY"

@@ -10,7 +10,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Array
+from specimap_core.arrays import Array
 
 # Stored where there is nothing, whether the file says so or not.
 _USUAL_NO_DATA = (-9999.0, -999.0, -32768.0, -32767.0)

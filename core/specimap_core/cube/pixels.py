@@ -9,8 +9,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Array
 from specimap_core.cube.strided import Bands, band_mean, native, rows_contiguous, to_bip
-from specimap_core.geometry.cameras import Array
 
 # Strips of about this size keep two threads busy and stay near the last-level cache.
 STRIP_BYTES = 12 << 20

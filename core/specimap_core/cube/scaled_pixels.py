@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Array, Floats
 from specimap_core.cube.pixels import Pixels
 from specimap_core.cube.strided import to_bip
-from specimap_core.geometry.cameras import Array, Floats
 
 # Numbers in text, and in another type than the data's, match up to this share of themselves.
 _ROUNDING = 1e-6

@@ -7,8 +7,8 @@ import unicodedata
 from dataclasses import dataclass
 from typing import Literal
 
+from specimap_core.arrays import Floats
 from specimap_core.cube.printable import printable
-from specimap_core.geometry.cameras import Floats
 
 Kind = Literal["length", "wavenumber", "frequency", "energy", "index", "none", "unrecognised"]
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Array
+from specimap_core.arrays import Array
 
 # OpenCV's transpose only moves bytes: any element of the same size will do.
 _CARRIER: dict[int, np.dtype] = {n: np.dtype(t) for n, t in ((1, "u1"), (2, "u2"), (4, "f4"), (8, "f8"))}

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import tifffile
 
+from specimap_core.arrays import Array
 from specimap_core.cube.declared_values import WORDS, declared_of, plain
 from specimap_core.cube.discover import Variable, cube_axes
 from specimap_core.cube.model import Cube, check_dtype, describe
@@ -24,7 +25,6 @@ from specimap_core.cube.pixels import ArrayPixels
 from specimap_core.cube.tiff_wavelengths import named_wavelengths
 from specimap_core.cube.unpacked import scratch_array
 from specimap_core.errors import CubeFormatError, CubeTruncatedError
-from specimap_core.geometry.cameras import Array
 from specimap_core.notices import Notice, Notices
 
 _GDAL_METADATA, _GDAL_NODATA = 42112, 42113

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import tifffile
 
+from specimap_core.arrays import Floats
 from specimap_core.cube.discover import Variable, choose_wavelengths
-from specimap_core.geometry.cameras import Floats
 
 _GDAL_METADATA = 42112
 _LONGEST = 16 << 20

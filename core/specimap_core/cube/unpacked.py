@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from specimap_core.arrays import Array
 from specimap_core.atomic import disk_errors
-from specimap_core.geometry.cameras import Array
 
 IN_MEMORY_BYTES = 256 << 20
 

@@ -12,12 +12,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Array, Floats
 from specimap_core.cube.declared_values import Declared, check_counts
 from specimap_core.cube.outliers import bounds, clip_level, dead_elements, undeclared_no_data
 from specimap_core.cube.pixels import Pixels, sampled_rows
 from specimap_core.cube.scaled_pixels import Missing, ScaledPixels, as_unsigned
 from specimap_core.cube.strided import to_bip
-from specimap_core.geometry.cameras import Array, Floats
 from specimap_core.notices import Notice, Notices
 
 Quantity = Literal["reflectance", "counts"]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from specimap_core.arrays import Floats
 from specimap_core.cube.spectral_units import Unit, read_unit
-from specimap_core.geometry.cameras import Floats
 from specimap_core.notices import Notice, Notices
 
 # No optical instrument reaches beyond: what lies outside is in another unit, or no wavelength.

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from specimap_core.arrays import Array
 from specimap_core.atomic import atomic_path
 from specimap_core.cloud import Cloud
-from specimap_core.geometry.cameras import Array
 from specimap_core.json_text import json_text
 
 _BLOCK = 16384

@@ -16,13 +16,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Array, Bytes, Floats
 from specimap_core.errors import UnknownDictionaryError
 from specimap_core.fiducials.subpixel import UNMEASURED_PX, refine_corners
 from specimap_core.fiducials.tone import TRIALS, shift_of_cells, tone_between
-from specimap_core.geometry.cameras import Array, Floats
 from specimap_core.photos.colour import linear_from_srgb
-
-Bytes = NDArray[np.uint8]
 
 SMALLEST_EDGE_PX = 7.0
 ENLARGED_PX = 1600

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from specimap_core.arrays import Floats
 from specimap_core.fiducials.observations import square_corners
-from specimap_core.geometry.cameras import Floats, Pose, fit_similarity
+from specimap_core.geometry.cameras import Pose, fit_similarity
 
 
 def marker_frame(corners: Floats, camera_centres: Floats) -> Pose:

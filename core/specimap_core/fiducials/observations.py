@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats, Pose
-
-Ints = NDArray[np.int64]
+from specimap_core.arrays import Floats, Ints
+from specimap_core.geometry.cameras import Pose
 
 
 @dataclass(frozen=True)

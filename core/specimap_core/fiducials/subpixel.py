@@ -10,12 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats
+from specimap_core.arrays import Flags, Floats, Singles
 from specimap_core.geometry.image_sampling import sample
 from specimap_core.geometry.robust import SIGMA_OF_MAD
-
-Flags = NDArray[np.bool_]
-Singles = NDArray[np.float32]
 
 PROFILES_PER_EDGE = 24
 EDGE_MARGIN = 0.12

@@ -13,13 +13,9 @@ from functools import cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from specimap_core.arrays import Floats, Singles
 from specimap_core.fiducials.subpixel import edge_positions, outward_normals
-from specimap_core.geometry.cameras import Floats
-
-Flags = NDArray[np.bool_]
-Singles = NDArray[np.float32]
 
 TRIALS = 1.0, 0.6
 """Powers of linear light at which cells are measured; between and a little beyond them the shift is a straight line."""

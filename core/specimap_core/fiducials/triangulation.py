@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from specimap_core.arrays import Floats
 from specimap_core.fiducials.observations import Observations
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
+from specimap_core.geometry.cameras import Intrinsics, Pose
 
 LEAST_PARALLAX = 1e-5
 """Angle in radians between rays below which the place where they meet is open: far less than a pixel spans."""

@@ -7,13 +7,10 @@ A pixel's centre has integer coordinates (OpenCV). COLMAP puts the centre of the
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
-Floats = NDArray[np.float64]
+from specimap_core.arrays import Floats
 
 
 @dataclass(frozen=True)

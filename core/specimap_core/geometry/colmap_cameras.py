@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pycolmap
 
-from specimap_core.geometry.cameras import Floats, Intrinsics
+from specimap_core.arrays import Floats
+from specimap_core.geometry.cameras import Intrinsics
 
 COLMAP_HALF_PIXEL = 0.5
 

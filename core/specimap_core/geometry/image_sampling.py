@@ -6,11 +6,8 @@ from collections.abc import Iterator
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats
-
-Singles = NDArray[np.float32]
+from specimap_core.arrays import Floats, Singles
 
 MOST = 32_766
 """OpenCV's ``remap`` takes fewer rows and columns than 2^15, of what it reads and of what it gives."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from specimap_core.geometry.cameras import Floats, Intrinsics
+from specimap_core.arrays import Floats
+from specimap_core.geometry.cameras import Intrinsics
 
 LENS = 5
 """Unknowns of a lens: logarithm of the focal length, cx, cy, k1, k2."""

@@ -12,7 +12,8 @@ from typing import Literal
 
 import numpy as np
 
-from specimap_core.geometry.cameras import Floats, View
+from specimap_core.arrays import Floats
+from specimap_core.geometry.cameras import View
 
 Axis = Literal["rows", "columns"]
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
+from specimap_core.arrays import Floats
+from specimap_core.geometry.cameras import Intrinsics, Pose
 
 TRIANGULATION_PX = 2.0
 

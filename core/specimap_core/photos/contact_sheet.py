@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specimap_core.arrays import Bytes
 from specimap_core.errors import PhotoUnreadableError
 
 TILE_PX = 256
 """Longer side of a tile."""
 _QUALITY = 85
-
-Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)

@@ -13,19 +13,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
+from specimap_core.arrays import Flags, Floats, Singles
+from specimap_core.geometry.cameras import Intrinsics, Pose
 from specimap_core.geometry.robust import SIGMA_OF_MAD
 from specimap_core.photos.reading import Photo
-
-Grey = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 DETAIL_PX = 1.0
 """Detail much longer than this sd of a Gaussian is shading, not texture. It is the sd of the tensor's window, too."""
 ABOVE_NOISE = 3.0
 """Gradients, RMS in the direction of the weaker, count from this multiple of what noise alone gives."""
 LEAST_NOISE = 0.5
-"""Grey levels: finer than half a step nothing is recorded, and compression removes it first."""
+"""Singles levels: finer than half a step nothing is recorded, and compression removes it first."""
 BLOCK_PX = 16
 SMOOTHEST = 0.1
 """Of all blocks of a photo, the smoothest share shows its noise."""
@@ -37,7 +35,7 @@ MUCH, SOME = 0.9, 0.75
 MOST_PHOTOS = 12
 
 
-def textured_share(grey: NDArray[np.uint8], region: Mask | None = None) -> float:
+def textured_share(grey: NDArray[np.uint8], region: Flags | None = None) -> float:
     """Share, 0 to 1, of ``region`` (H, W; all by default) of a photo (H, W) that is textured above its noise."""
     image = np.asarray(grey, np.float32)
     gx, gy = _gradients(image)
@@ -47,7 +45,7 @@ def textured_share(grey: NDArray[np.uint8], region: Mask | None = None) -> float
     return float(np.mean(textured if region is None else textured[region]))
 
 
-def _gradients(image: Grey) -> tuple[Grey, Grey]:
+def _gradients(image: Singles) -> tuple[Singles, Singles]:
     detail = image - cv2.GaussianBlur(image, (0, 0), DETAIL_PX)
     return (
         np.asarray(cv2.Sobel(detail, cv2.CV_32F, 1, 0), np.float32),
@@ -62,7 +60,7 @@ def _noise_energy() -> float:
     return float((_gradients(impulse)[0] ** 2).sum())
 
 
-def _noise(image: Grey) -> float:
+def _noise(image: Singles) -> float:
     """Sd of the noise, grey levels, in the smoothest blocks (Immerkaer 1996's mask, which no slope moves)."""
     mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
     rows, cols = (size // BLOCK_PX for size in image.shape)
@@ -73,7 +71,7 @@ def _noise(image: Grey) -> float:
     return float(SIGMA_OF_MAD * np.quantile(np.median(blocks, axis=1), SMOOTHEST))
 
 
-def between_markers(lens: Intrinsics, pose: Pose, corners: Floats, size: tuple[int, int]) -> Mask | None:
+def between_markers(lens: Intrinsics, pose: Pose, corners: Floats, size: tuple[int, int]) -> Flags | None:
     """Pixels (H, W) of a photo of ``size`` (width, height) inside the markers' hull and on no card.
 
     ``corners`` (Q, 4, 3) mm. None where the hull is next to nothing, as with one or two markers.
@@ -92,7 +90,7 @@ def between_markers(lens: Intrinsics, pose: Pose, corners: Floats, size: tuple[i
     return mask > 0 if mask.sum() >= LEAST_PX else None
 
 
-def usual_share(photos: Iterable[tuple[Photo, Mask | None]]) -> float:
+def usual_share(photos: Iterable[tuple[Photo, Flags | None]]) -> float:
     """Median of the photos' shares, each within its region; of many photos an even choice is looked at."""
     all_photos = list(photos)
     step = -(-len(all_photos) // MOST_PHOTOS)

@@ -16,15 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specimap_core import __version__
+from specimap_core.arrays import Floats
 from specimap_core.atomic import atomic_path, remove
 from specimap_core.bundle_adjust.adjust import Adjusted
 from specimap_core.fiducials.observations import Observations
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
+from specimap_core.geometry.cameras import Intrinsics, Pose
+from specimap_core.geometry.depth_map import DepthMap
 from specimap_core.json_text import json_text
 from specimap_core.notices import Notice
 from specimap_core.photos.reading import Refusal
 from specimap_core.reconstruct.backend import CornersInPhotos, Reconstruction
-from specimap_core.reconstruct.dense.depth_map import DepthMap
 from specimap_core.render.orthographic import Grid
 from specimap_core.surface.fusion import Mesh
 

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from specimap_core.arrays import Floats
 from specimap_core.bundle_adjust.adjust import Adjusted
 from specimap_core.bundle_adjust.solver import MarkerScene
-from specimap_core.geometry.cameras import Floats, View
+from specimap_core.geometry.cameras import View
 from specimap_core.pipeline.artefacts import Stage1
 from specimap_core.register.cube_markers import CubeMarkers, unmirrored
 from specimap_core.report.model import CubeCorners, PhotoCorners

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specimap_core import __version__
+from specimap_core.arrays import Floats
 from specimap_core.bundle_adjust.adjust import Adjusted
 from specimap_core.cloud import CloudPoints, Flag
 from specimap_core.fiducials.layout import edge_lengths
 from specimap_core.fiducials.triangulation import triangulate
-from specimap_core.geometry.cameras import Floats
 from specimap_core.notices import Notice
 from specimap_core.pipeline.artefacts import Stage1
 from specimap_core.pipeline.corners import cube_corners, photo_corners

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from specimap_core.arrays import Floats
 from specimap_core.errors import EdgeImplausibleError, SettingsError
-from specimap_core.geometry.cameras import Floats, Pose
+from specimap_core.geometry.cameras import Pose
 from specimap_core.pipeline.options import OPTIONS, OTHER_UNITS
 from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.render.orthographic import LARGEST_GRID_CELLS

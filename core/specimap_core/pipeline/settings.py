@@ -10,8 +10,8 @@ from specimap_core.fiducials.detection import dictionary_named
 from specimap_core.photos.reading import AcquisitionSettings
 from specimap_core.pipeline.options import Backend, RunOptions, check_choice, check_number
 from specimap_core.reconstruct.backend import ReconstructSettings
-from specimap_core.reconstruct.dense.depth_map import DepthSettings
 from specimap_core.reconstruct.dense.device import DEVICES, Device
+from specimap_core.reconstruct.dense.settings import DepthSettings
 from specimap_core.register.placement import RegisterSettings
 from specimap_core.render.orthographic import RenderSettings
 from specimap_core.surface.fusion import SurfaceSettings

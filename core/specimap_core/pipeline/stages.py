@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Floats
 from specimap_core.bundle_adjust.adjust import adjust
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
+from specimap_core.geometry.cameras import Intrinsics, Pose
+from specimap_core.geometry.depth_map import DepthMap
 from specimap_core.native import preload
 from specimap_core.notices import Notice
 from specimap_core.photos.contact_sheet import contact_sheet
@@ -31,7 +33,6 @@ from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.reconstruct.backend import ReconstructionBackend, corners_in_photos, detect_in_photos
 from specimap_core.reconstruct.backends.environment import UNCONFIGURED, BackendSettings
 from specimap_core.reconstruct.backends.requirements import check_required
-from specimap_core.reconstruct.dense.depth_map import DepthMap
 from specimap_core.reconstruct.dense.volume import volume_over
 from specimap_core.reconstruct.focal_breathing import correct_focal_breathing
 from specimap_core.reconstruct.photo_resolution import at_own_resolution

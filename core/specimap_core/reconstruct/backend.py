@@ -21,9 +21,10 @@ from specimap_core.fiducials.detection import (
 )
 from specimap_core.fiducials.observations import Observations
 from specimap_core.geometry.cameras import Intrinsics, Pose
+from specimap_core.geometry.depth_map import DepthMap
 from specimap_core.notices import Notices
 from specimap_core.photos.reading import Photo, Refusal
-from specimap_core.reconstruct.dense.depth_map import DepthMap, DepthSettings
+from specimap_core.reconstruct.dense.settings import DepthSettings
 
 if TYPE_CHECKING:
     from specimap_core.reconstruct.poses_from_markers import MarkerSolution

@@ -15,10 +15,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Floats
 from specimap_core.bundle_adjust.solver import HUBER, MarkerScene
 from specimap_core.errors import SpecimapError
 from specimap_core.fiducials.observations import Observations
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, rotation_from_vector, skew
+from specimap_core.geometry.cameras import Intrinsics, Pose, rotation_from_vector, skew
 from specimap_core.geometry.robust import MEDIAN_OF_RAYLEIGH
 from specimap_core.photos.colour import linear_from_srgb, srgb_from_linear
 from specimap_core.photos.reading import Photo

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from specimap_core.arrays import Floats
 from specimap_core.errors import PhotosNotConnectedError, TooFewPhotosError
 from specimap_core.fiducials.layout import marker_frame
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
+from specimap_core.geometry.cameras import Intrinsics, Pose
 from specimap_core.notices import Notices
 from specimap_core.photos.reading import Photo, Refusal, stated_focal_px
 from specimap_core.reconstruct.backend import CornersInPhotos, ReconstructSettings

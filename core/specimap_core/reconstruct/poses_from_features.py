@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from specimap_core.arrays import Floats
 from specimap_core.errors import BackendUnavailableError
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
+from specimap_core.geometry.cameras import Intrinsics, Pose
 from specimap_core.notices import Notice, Notices
 from specimap_core.photos.reading import Photo
 from specimap_core.photos.texture import between_markers, in_words, usual_share

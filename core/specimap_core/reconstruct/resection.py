@@ -12,13 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
+from specimap_core.arrays import Floats
+from specimap_core.geometry.cameras import Intrinsics, Pose
 from specimap_core.geometry.colmap_cameras import colmap_camera, colmap_from_opencv
 from specimap_core.geometry.triangulation import triangulate_pair
 from specimap_core.native import quiet_colmap
 from specimap_core.photos.reading import Photo
-from specimap_core.reconstruct.dense.depth_map import DepthSettings
 from specimap_core.reconstruct.dense.pairs import choose_pairs
+from specimap_core.reconstruct.dense.settings import DepthSettings
 from specimap_core.reconstruct.features.base import FeatureKind, Features, Pairs
 from specimap_core.reconstruct.features.sift import match
 

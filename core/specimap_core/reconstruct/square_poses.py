@@ -5,8 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from specimap_core.arrays import Floats
 from specimap_core.fiducials.observations import Observations, corners_of, square_corners
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, rotation_from_vector
+from specimap_core.geometry.cameras import Intrinsics, Pose, rotation_from_vector
 
 REFERENCES = 8
 """Photos whose own layout of markers is tried as the one that the others are judged by."""

@@ -13,11 +13,12 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from specimap_core.arrays import Floats
 from specimap_core.bundle_adjust.solver import MarkerScene
 from specimap_core.fiducials.layout import edge_lengths, marker_frame
 from specimap_core.fiducials.observations import Observations
 from specimap_core.fiducials.triangulation import triangulate
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
+from specimap_core.geometry.cameras import Intrinsics, Pose
 from specimap_core.geometry.colmap_cameras import colmap_from_opencv, opencv_from_colmap
 from specimap_core.native import quiet_colmap
 from specimap_core.photos.reading import Photo

@@ -7,13 +7,14 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Floats
 from specimap_core.errors import SpecimapError
-from specimap_core.geometry.cameras import Floats, View
+from specimap_core.geometry.cameras import View
 from specimap_core.register.camera_fitting import refit
 from specimap_core.register.corners import CornersInCube
+from specimap_core.register.figures import LeaveOneOut, MethodFigures, Quartiles, Spread
 from specimap_core.register.placement import fit_homography
 from specimap_core.render.orthographic import Grid
-from specimap_core.report.model import LeaveOneOut, MethodFigures, Quartiles, Spread
 from specimap_core.surface.raycast import RayCaster
 
 

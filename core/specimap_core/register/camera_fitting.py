@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from specimap_core.geometry.cameras import Floats, View, rotation_from_vector
+from specimap_core.arrays import Floats
+from specimap_core.geometry.cameras import View, rotation_from_vector
 from specimap_core.geometry.pushbroom import ScanView
 from specimap_core.geometry.robust import SIGMA_OF_MAD
 from specimap_core.register.camera_models import (

@@ -11,8 +11,9 @@ from typing import Literal
 
 import numpy as np
 
+from specimap_core.arrays import Floats
 from specimap_core.errors import RegistrationError
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, View, rotation_from_vector
+from specimap_core.geometry.cameras import Intrinsics, Pose, View, rotation_from_vector
 from specimap_core.geometry.pushbroom import Axis, ScanView
 
 Kind = Literal["frame", "frame_aspect", "scan_rows", "scan_columns"]

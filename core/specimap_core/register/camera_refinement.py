@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from specimap_core.arrays import Floats
 from specimap_core.errors import RegistrationError
-from specimap_core.geometry.cameras import Floats, View
+from specimap_core.geometry.cameras import View
 from specimap_core.geometry.pushbroom import ScanView
 from specimap_core.notices import Notice
 from specimap_core.register.camera_fitting import CubeObservations

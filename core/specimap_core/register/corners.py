@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Floats
 from specimap_core.bundle_adjust.adjust import Adjusted
-from specimap_core.geometry.cameras import Floats
 from specimap_core.register.cube_markers import CubeMarkers, unmirrored
 
 SIGMA_FLOOR_PX = 0.03

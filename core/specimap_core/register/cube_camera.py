@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
+from specimap_core.arrays import Floats
 from specimap_core.errors import RegistrationError
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, View, rotation_from_vector
+from specimap_core.geometry.cameras import Intrinsics, Pose, View, rotation_from_vector
 from specimap_core.geometry.pushbroom import ScanView
 from specimap_core.register.camera_models import FOCAL_PRIOR_SD, FOCAL_RANGE, FRAME, Model, apply_step
 

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Array, Floats
 from specimap_core.errors import DuplicateMarkersError, MarkersMissingInCubeError
 from specimap_core.fiducials.detection import Detection, detect_markers
-from specimap_core.geometry.cameras import Array, Floats
 
 LEAST_MARKERS = 2
 WINDOWS = 6

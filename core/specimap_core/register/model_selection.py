@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from specimap_core.arrays import Floats
 from specimap_core.errors import RegistrationError
-from specimap_core.geometry.cameras import Floats, View
+from specimap_core.geometry.cameras import View
 from specimap_core.geometry.robust import SIGMA_OF_MAD
 from specimap_core.register.camera_fitting import CameraFit, CubeObservations, TileObservations, fit
 from specimap_core.register.camera_models import (

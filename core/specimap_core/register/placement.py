@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from specimap_core.arrays import Floats
 from specimap_core.errors import RegistrationError
-from specimap_core.geometry.cameras import Floats, View
+from specimap_core.geometry.cameras import View
 from specimap_core.render.orthographic import Grid
 from specimap_core.surface.raycast import RayCaster
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Floats
 from specimap_core.cloud import CloudPoints, Flag
-from specimap_core.geometry.cameras import Floats
 from specimap_core.register.placement import GRAZING_DEG, Placement
 from specimap_core.surface.raycast import RayCaster
 from specimap_core.surface.regions import on_card, on_specimen

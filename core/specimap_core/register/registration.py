@@ -8,14 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Floats
 from specimap_core.bundle_adjust.adjust import Adjusted
 from specimap_core.cloud import CloudPoints
 from specimap_core.cube import Cube
-from specimap_core.geometry.cameras import Floats
 from specimap_core.register.accuracy import camera_figures, homography_figures
 from specimap_core.register.camera_refinement import RefinedCamera, refine_camera
 from specimap_core.register.corners import corners_in_cube
 from specimap_core.register.cube_markers import CubeMarkers, find_markers, unmirrored
+from specimap_core.register.figures import MethodFigures
 from specimap_core.register.placement import (
     Homography,
     Method,
@@ -27,7 +28,6 @@ from specimap_core.register.placement import (
 )
 from specimap_core.register.points import cloud_points
 from specimap_core.render.orthographic import Grid
-from specimap_core.report.model import MethodFigures
 from specimap_core.surface.raycast import RayCaster
 
 

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats, View
+from specimap_core.arrays import Floats
+from specimap_core.geometry.cameras import View
 from specimap_core.geometry.robust import SIGMA_OF_MAD
 from specimap_core.register.tile_matching import LEAST_TILES
 from specimap_core.register.tile_offsets import TileOffsets, measure_tile_offsets

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from specimap_core.geometry.cameras import Floats
+from specimap_core.arrays import Floats
 
 LEAST_ALONG, LEAST_TILES = 3, 5
 """A small specimen gets smaller tiles, so that there are several; with fewer their scatter says nothing."""

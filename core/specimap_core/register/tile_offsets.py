@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats, View
+from specimap_core.arrays import Floats
+from specimap_core.geometry.cameras import View
 from specimap_core.register.destriping import destriped
 from specimap_core.register.tile_matching import Tiles
 from specimap_core.surface.raycast import RayCaster

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Floats
 from specimap_core.errors import SettingsError
-from specimap_core.geometry.cameras import Floats
 from specimap_core.surface.raycast import RayCaster
 
 LARGEST_GRID_CELLS = 25_000_000

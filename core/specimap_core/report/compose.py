@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
 
+from specimap_core.register.figures import LeaveOneOut, MethodFigures
 from specimap_core.report import published
 from specimap_core.report.blocks import Block, Bullets, Callout, Document, Level, Paragraph, Section, Table
 from specimap_core.report.illustrations import (
@@ -16,7 +17,7 @@ from specimap_core.report.illustrations import (
     truth_blocks,
 )
 from specimap_core.report.inputs import Material
-from specimap_core.report.model import LeaveOneOut, MethodFigures, Report
+from specimap_core.report.model import Report
 from specimap_core.report.wording import (
     MEANINGS,
     REFUSAL_ADVICE,

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specimap_core.arrays import Bytes
 from specimap_core.cloud import Cloud
 from specimap_core.errors import PhotoUnreadableError
 from specimap_core.photos.contact_sheet import read_tiles
@@ -18,8 +18,6 @@ from specimap_core.report.model import Report, read_report
 
 if TYPE_CHECKING:
     from specimap_core.truth.judge import Judged
-
-Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Array, Singles
 from specimap_core.cloud import Cloud, Flag
 from specimap_core.cloud.top_view import extent_mm, top_view
-from specimap_core.geometry.cameras import Array
 
 MOST_PX = 900
 """Longer side of a map: a picture across the page has no more pixels to show it with."""
@@ -17,8 +17,6 @@ _FITTED_POINTS = 20_000
 _CELL_SPACINGS = 1.45
 """Cell of the top view over the distance of neighbouring points: a little above the square's diagonal, so that no cell
 of a flat surface stays empty however the cube was turned."""
-
-Picture = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +29,7 @@ class CubeFrame:
     mm_per_px: float
     _cell: NDArray[np.int64]
 
-    def mean(self, values: Array, points: Array | None = None) -> Picture:
+    def mean(self, values: Array, points: Array | None = None) -> Singles:
         """Map (rows, cols) of the mean of ``values`` (S,), or of those (n,) of ``points``; NaN where there is none."""
         cell = self._cell if points is None else self._cell[points]
         finite = np.isfinite(values)
@@ -80,7 +78,7 @@ class TopRaster:
     """The topmost surface on a grid, y up: ``height_mm`` (rows, cols), ``rgb`` (rows, cols, 3); and where it lies:
     ``extent_mm`` left, right, bottom, top."""
 
-    height_mm: Picture
+    height_mm: Singles
     rgb: NDArray[np.uint8]
     extent_mm: tuple[float, float, float, float]
     grid_mm: float

@@ -5,37 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import Field
 
 from specimap_core.errors import NotFoundError
 from specimap_core.json_text import json_ready, json_text
 from specimap_core.notices import Notice
-
-# JSON has no NaN: a figure that could not be had is null there.
-Figure = Annotated[float, BeforeValidator(lambda value: float("nan") if value is None else value)]
-
-
-class Section(BaseModel):
-    """A part of the report; unknown fields are an error, so that a misspelt one does not get lost."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Spread(Section):
-    """Mean and standard deviation of ``n`` values, mm."""
-
-    mean: Figure
-    std: Figure
-    n: int
-
-
-class Quartiles(Section):
-    """Median and quartiles of ``n`` values, mm; NaN where ``n`` is 0."""
-
-    median: Figure
-    q1: Figure
-    q3: Figure
-    n: int
+from specimap_core.register.figures import Figure, LeaveOneOut, MethodFigures, Quartiles, Section, Spread
 
 
 class EdgeLength(Section):
@@ -45,14 +20,6 @@ class EdgeLength(Section):
     mean: Figure
     std: Figure
     n: int
-
-
-class LeaveOneOut(Section):
-    """Errors at a marker that took no part in the registration, mm. None where too few markers are left."""
-
-    median: Figure
-    maximum: Figure
-    per_marker: dict[str, Figure]
 
 
 class Refused(Section):
@@ -85,14 +52,6 @@ class Reprojection(Section):
 
     before: Figure
     after: Figure
-
-
-class MethodFigures(Section):
-    """Accuracy of one registration method at the markers."""
-
-    corner_2d_mm: Spread
-    corner_3d_mm: Quartiles
-    leave_one_marker_out_mm: LeaveOneOut | None
 
 
 class CubeCameraFigures(Section):

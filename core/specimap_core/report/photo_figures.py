@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from specimap_core.geometry.cameras import Floats
+from specimap_core.arrays import Bytes, Floats
+from specimap_core.register.figures import MethodFigures
 from specimap_core.report import plotting as p
-from specimap_core.report.inputs import Bytes
-from specimap_core.report.model import CubeCorners, MethodFigures, PhotoCorners
+from specimap_core.report.model import CubeCorners, PhotoCorners
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

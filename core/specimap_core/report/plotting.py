@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from specimap_core.arrays import Array
 from specimap_core.errors import BackendUnavailableError
-from specimap_core.geometry.cameras import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

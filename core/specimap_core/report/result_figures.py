@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Bytes
 from specimap_core.cloud import Cloud, Flag
 from specimap_core.report import plotting as p
-from specimap_core.report.inputs import Bytes
 from specimap_core.report.maps import CubeFrame, TopRaster
 from specimap_core.report.model import CubeCorners
 from specimap_core.report.photo_figures import corners_of

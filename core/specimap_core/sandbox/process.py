@@ -20,9 +20,9 @@ from typing import Any, NoReturn
 import numpy as np
 
 from specimap_core import errors
+from specimap_core.arrays import Array
 from specimap_core.atomic import disk_errors
 from specimap_core.errors import BackendFailedError, BackendUnavailableError, SpecimapError
-from specimap_core.geometry.cameras import Array
 from specimap_core.json_text import json_text
 from specimap_core.sandbox import child
 from specimap_core.sandbox.environment import bare_environment

@@ -9,13 +9,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Floats
 from specimap_core.cube import FORMATS, Cube, inspect, open_cube
 from specimap_core.cube.envi_header import EnviHeader, is_envi_header, read_header
 from specimap_core.cube.npy import starts_with
 from specimap_core.cube.pixels import sampled_rows
 from specimap_core.cube.wavelengths import bad_band_mask, nanometres
 from specimap_core.errors import CubeFormatError, CubeHeaderError, SpecimapError, StorageFullError
-from specimap_core.geometry.cameras import Floats
 from specimap_core.notices import Notices
 from specimap_core.screening.verdict import Verdict
 

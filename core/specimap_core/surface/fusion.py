@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
+from specimap_core.arrays import Floats
 from specimap_core.errors import DepthNotFoundError
-from specimap_core.geometry.cameras import Floats, Pose
+from specimap_core.geometry.cameras import Pose
+from specimap_core.geometry.depth_map import DepthMap
 from specimap_core.native import open3d
-from specimap_core.reconstruct.dense.depth_map import DepthMap
 
 BLOCK_VOXELS = 8
 """Edge of a block of voxels: 16 touch twice the memory and time for the same surface."""

@@ -10,9 +10,9 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Array
 from specimap_core.atomic import atomic_path
 from specimap_core.errors import CloudDamagedError, SettingsError
-from specimap_core.geometry.cameras import Array
 from specimap_core.json_text import json_text
 from specimap_core.photos.colour import linear_from_srgb
 from specimap_core.surface.fusion import Mesh

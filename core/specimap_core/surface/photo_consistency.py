@@ -10,13 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
+from specimap_core.arrays import Floats, Ints, Singles
+from specimap_core.geometry.cameras import Intrinsics, Pose
 from specimap_core.geometry.image_sampling import sample
 from specimap_core.surface.fusion import Mesh
 from specimap_core.surface.raycast import RayCaster
-
-Singles = NDArray[np.float32]
-Indices = NDArray[np.int64]
 
 CHUNK = 8192
 """Vertices whose views are chosen at a time."""
@@ -46,8 +44,8 @@ class Photographs:
 
 
 def choose_views(
-    mesh: Mesh, chosen: Indices, photographs: Photographs, most: int, least_cosine: float, *, workers: int = 1
-) -> Indices:
+    mesh: Mesh, chosen: Ints, photographs: Photographs, most: int, least_cosine: float, *, workers: int = 1
+) -> Ints:
     """For each of the ``chosen`` (n,) vertices the photos that are compared there, (n, most), -1 where there are fewer:
     those that see it most squarely and unhidden, and not in a highlight.
 
@@ -67,9 +65,7 @@ def choose_views(
     return np.take_along_axis(views, order, 1)
 
 
-def _most_frontal(
-    caster: RayCaster, chosen: Indices, photographs: Photographs, most: int, least_cosine: float
-) -> Indices:
+def _most_frontal(caster: RayCaster, chosen: Ints, photographs: Photographs, most: int, least_cosine: float) -> Ints:
     """The photos that see each vertex most squarely and unhidden, (n, most); -1 where there are fewer."""
     mesh, lens, poses = caster.mesh, photographs.lens, photographs.poses
     points, normals = mesh.vertices[chosen].astype(float), mesh.normals[chosen].astype(float)
@@ -99,7 +95,7 @@ def _most_frontal(
     return views
 
 
-def _highlights(points: Floats, views: Indices, photographs: Photographs) -> NDArray[np.bool_]:
+def _highlights(points: Floats, views: Ints, photographs: Photographs) -> NDArray[np.bool_]:
     """Which ``views`` (n, k) of the points (n, 3) show a highlight there."""
     bright = np.full(views.shape, np.nan, np.float32)
     gain = np.ones(len(photographs.poses), np.float32)
@@ -130,7 +126,7 @@ def _median_of_known(values: Singles) -> Singles:
 def patch_scores(
     points: Floats,
     normals: Floats,
-    views: Indices,
+    views: Ints,
     photographs: Photographs,
     offsets: Floats,
     sample_mm: float,

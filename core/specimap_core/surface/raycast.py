@@ -10,7 +10,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats
+from specimap_core.arrays import Floats
 from specimap_core.surface.fusion import Mesh
 
 CHUNK = 1 << 18

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
+from specimap_core.arrays import Floats
+from specimap_core.geometry.cameras import Intrinsics, Pose
 from specimap_core.progress import within
 from specimap_core.surface.fusion import Mesh, edges_between, vertex_normals
 from specimap_core.surface.photo_consistency import Photographs, choose_views, patch_scores

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats
+from specimap_core.arrays import Floats
 
 CARD_OVER_MARKER = 1.5
 """Edge of a card over that of its marker (10.2 mm over 6.8 mm in the published layout)."""

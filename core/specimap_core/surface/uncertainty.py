@@ -17,9 +17,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats, Pose
+from specimap_core.arrays import Floats
+from specimap_core.geometry.cameras import Pose
+from specimap_core.geometry.depth_map import DepthMap
 from specimap_core.geometry.robust import SIGMA_OF_MAD
-from specimap_core.reconstruct.dense.depth_map import DepthMap
 from specimap_core.surface.fusion import Mesh, edges_between
 from specimap_core.surface.refinement import Refined
 

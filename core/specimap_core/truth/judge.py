@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Floats
 from specimap_core.cloud import Cloud
 from specimap_core.errors import SettingsError
-from specimap_core.geometry.cameras import Floats, fit_similarity
+from specimap_core.geometry.cameras import fit_similarity
 from specimap_core.truth.truth_file import load_truth
 
 SPECIMEN = 1

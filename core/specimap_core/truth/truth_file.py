@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from specimap_core.arrays import Array, Floats
 from specimap_core.atomic import atomic_path
 from specimap_core.errors import NotFoundError
-from specimap_core.geometry.cameras import Array, Floats, Intrinsics, Pose, View
+from specimap_core.geometry.cameras import Intrinsics, Pose, View
 from specimap_core.geometry.pushbroom import Axis, ScanView, WobblyScan
 
 

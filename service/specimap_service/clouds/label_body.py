@@ -11,9 +11,9 @@ import numpy as np
 import pyarrow as pa
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from specimap_core.arrays import Array
 from specimap_core.cloud.labels import LARGEST_CLASS, checked_labels
 from specimap_core.errors import LabelInvalidError
-from specimap_core.geometry.cameras import Array
 from specimap_service.errors import RequestInvalidError
 
 HEADER = "X-Specimap-Label"

@@ -13,10 +13,10 @@ from uuid import uuid4
 import sqlalchemy as sa
 from sqlalchemy.orm import Session
 
+from specimap_core.arrays import Array
 from specimap_core.atomic import disk_errors, remove
 from specimap_core.cloud.labels import describe_label, write_label
 from specimap_core.errors import NotFoundError
-from specimap_core.geometry.cameras import Array
 from specimap_core.json_text import json_text
 from specimap_infra.errors import DatabaseUnavailableError
 from specimap_infra.labels import lock_cloud

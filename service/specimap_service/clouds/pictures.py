@@ -13,10 +13,10 @@ from cmap import Colormap
 from numpy.typing import NDArray
 from PIL import Image
 
+from specimap_core.arrays import Array
 from specimap_core.cloud import Cloud
 from specimap_core.cloud.top_view import extent_mm, top_view
 from specimap_core.errors import NotFoundError
-from specimap_core.geometry.cameras import Array
 from specimap_service.errors import RequestInvalidError
 
 Grid = Literal["cube", "marker"]

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
+from specimap_core.arrays import Array
 from specimap_core.cloud import Cloud, Flag
-from specimap_core.geometry.cameras import Array
 from specimap_service.array_responses import Columns
 from specimap_service.errors import RequestInvalidError
 

@@ -8,9 +8,9 @@ import numpy as np
 from fastapi import APIRouter, Depends, Path, Query, Request
 from starlette.responses import Response
 
+from specimap_core.arrays import Array
 from specimap_core.cloud import Cloud
 from specimap_core.errors import NotFoundError
-from specimap_core.geometry.cameras import Array
 from specimap_core.json_text import json_text
 from specimap_service.array_responses import (
     ARROW,

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from specimap_core.arrays import Singles
 from specimap_core.fiducials.observations import Observations
 from specimap_core.geometry.cameras import Intrinsics, Pose, View, look_at
 from specimap_core.reconstruct.backends.da3.backend import Metric, in_millimetres, maps_of, smooth_surface
@@ -13,7 +14,7 @@ from specimap_core.reconstruct.backends.da3.prepare import conditioning, plan_pr
 from specimap_core.reconstruct.backends.da3.residual_field import correct_residuals
 from specimap_core.reconstruct.backends.depth_alignment import align, depths_at, on_markers
 from specimap_core.reconstruct.dense.cross_check import confirmed, nearest_photos
-from specimap_core.reconstruct.dense.volume import Singles, volume_over
+from specimap_core.reconstruct.dense.volume import volume_over
 from specimap_validation.phantom import Phantom
 from tests.support.scenes import SMALL, OnDisk
 from tests.support.true_depth import true_depth

@@ -24,8 +24,8 @@ from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES, ba
 from specimap_core.reconstruct.backends.mast3r import settings as mast3r
 from specimap_core.reconstruct.backends.requirements import check_required
 from specimap_core.reconstruct.dense import patchmatch
-from specimap_core.reconstruct.dense.depth_map import DepthSettings
 from specimap_core.reconstruct.dense.device import DEVICES, Device, dense_device
+from specimap_core.reconstruct.dense.settings import DepthSettings
 from specimap_core.reconstruct.features import choice
 from specimap_core.sandbox.environment import bare_environment
 from specimap_core.sandbox.process import child_environment

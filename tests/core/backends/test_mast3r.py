@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from specimap_core.arrays import Floats
 from specimap_core.errors import (
     BackendUnavailableError,
     DepthNotFoundError,
@@ -17,7 +18,7 @@ from specimap_core.errors import (
     PhotosNotConnectedError,
 )
 from specimap_core.fiducials.observations import Observations
-from specimap_core.geometry.cameras import Floats, Pose, fit_similarity, rotation_from_vector
+from specimap_core.geometry.cameras import Pose, fit_similarity, rotation_from_vector
 from specimap_core.reconstruct.backend import Reconstruction
 from specimap_core.reconstruct.backends.mast3r.backend import LICENCE
 from specimap_core.reconstruct.backends.mast3r.maps import bytes_of

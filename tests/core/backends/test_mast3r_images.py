@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Floats
 from specimap_core.errors import DepthNotFoundError, PhotosNotConnectedError, SettingsError
-from specimap_core.geometry.cameras import Floats
 from specimap_core.reconstruct.backends.mast3r.child import STEPS, TypedFailures, bars, require_finite
 from specimap_core.reconstruct.backends.mast3r.images import plan_preparation
 from specimap_core.reconstruct.backends.mast3r.metric import network_lens

@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from specimap_core.arrays import Floats
 from specimap_core.bundle_adjust.adjust import Adjusted, AdjustSettings, Form, adjust
 from specimap_core.bundle_adjust.solver import MarkerScene
 from specimap_core.errors import MarkerGeometryError
 from specimap_core.fiducials.layout import edge_lengths, marker_frame, rigid_square
 from specimap_core.fiducials.observations import Observations
 from specimap_core.fiducials.triangulation import triangulate
-from specimap_core.geometry.cameras import Floats, Pose, fit_similarity, rotation_from_vector
+from specimap_core.geometry.cameras import Pose, fit_similarity, rotation_from_vector
 from tests.support.scenes import EDGE_MM, marker_scene
 
 IDS = (3, 5, 8, 11)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from specimap_core.arrays import Floats
 from specimap_core.bundle_adjust.normal_equations import Assembly, damped_step
-from specimap_core.geometry.cameras import Floats
 
 LENS, PHOTOS, MARKERS = 5, 7, 4
 

@@ -14,12 +14,12 @@ import pytest
 from PIL import Image
 
 from specimap_client._models import Point
+from specimap_core.arrays import Array
 from specimap_core.cloud import Cloud, Flag
 from specimap_core.cloud.preview import write_preview
 from specimap_core.cloud.writer import write_cloud
 from specimap_core.cube import open_cube
 from specimap_core.export import export_cloud
-from specimap_core.geometry.cameras import Array
 from specimap_core.register.cube_markers import cleaned, find_in_image
 from specimap_service.array_responses import ARROW, NPY
 from tests.support.cloud_scene import FakeCube, scene

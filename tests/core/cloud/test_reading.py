@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import zarr
 
+from specimap_core.arrays import Array
 from specimap_core.cloud import ARRAYS, CHUNK_POINTS, Cloud, CloudPoints, tile_order
 from specimap_core.cloud import shards as shards_module
 from specimap_core.cloud.writer import write_cloud
 from specimap_core.errors import CloudDamagedError, NotFoundError
-from specimap_core.geometry.cameras import Array
 from tests.support.cloud_scene import FakeCube, counts, scene
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from specimap_core.arrays import Array
 from specimap_core.cloud import Cloud, Flag
 from specimap_core.cloud.writer import write_cloud
 from specimap_core.cube import inspect, open_cube
-from specimap_core.geometry.cameras import Array
 from tests.support.cloud_scene import scene
 
 

@@ -9,10 +9,10 @@ import h5py
 import numpy as np
 import pytest
 
+from specimap_core.arrays import Floats
 from specimap_core.cloud import Flag
 from specimap_core.cube import open_cube
 from specimap_core.errors import CubeHeaderError
-from specimap_core.geometry.cameras import Floats
 from tests.support.cube_files import random_values, write_envi
 from tests.support.notices import messages
 from tests.support.stored_values import FORMATS, as_image, codes, flagged, truth

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Bytes
 from specimap_core.errors import (
     DuplicateMarkersError,
     NoMarkersFoundError,
@@ -21,7 +22,7 @@ from specimap_core.fiducials.subpixel import refine_corners
 from specimap_core.photos.colour import linear_from_srgb
 from specimap_core.photos.reading import AcquisitionSettings, Photo, read_photo
 from specimap_core.reconstruct.backend import corners_in_photos
-from tests.support.marker_pictures import LAYOUT, Bytes, picture, square
+from tests.support.marker_pictures import LAYOUT, picture, square
 
 
 @pytest.mark.parametrize("blur_px", [0.6, 1.0])

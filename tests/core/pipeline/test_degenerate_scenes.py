@@ -11,6 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from specimap_core.arrays import Floats
 from specimap_core.bundle_adjust.adjust import AdjustSettings, Form, adjust
 from specimap_core.cloud import Cloud
 from specimap_core.cloud.preview import write_preview
@@ -18,10 +19,11 @@ from specimap_core.cloud.writer import write_cloud
 from specimap_core.cube import open_cube
 from specimap_core.errors import MemoryExhaustedError, SpecimapError, StageFailedError
 from specimap_core.export import export_cloud
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, View, look_at
+from specimap_core.geometry.cameras import Intrinsics, Pose, View, look_at
+from specimap_core.geometry.depth_map import DepthMap
 from specimap_core.pipeline.clock import Clock
-from specimap_core.reconstruct.dense.depth_map import DepthMap, DepthSettings
 from specimap_core.reconstruct.dense.multi_view import dense_depth
+from specimap_core.reconstruct.dense.settings import DepthSettings
 from specimap_core.reconstruct.dense.volume import volume_over
 from specimap_core.reconstruct.poses_from_markers import solve_from_markers
 from specimap_core.register.placement import fit_homography, place_by_camera, place_by_homography

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import pytest
 
+from specimap_core.arrays import Floats
 from specimap_core.errors import EdgeImplausibleError, SettingsError
-from specimap_core.geometry.cameras import Floats, Pose
+from specimap_core.geometry.cameras import Pose
 from specimap_core.pipeline.scale_check import check_scale, reach_mm
 from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.render.orthographic import RenderSettings

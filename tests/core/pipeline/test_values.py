@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from specimap_core.arrays import Array
 from specimap_core.cloud import Cloud, Flag
-from specimap_core.geometry.cameras import Array
 from specimap_core.pipeline.outputs import Inputs
 from specimap_core.pipeline.run import run_pipeline
 from specimap_core.pipeline.settings import PipelineSettings

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from specimap_core.geometry.cameras import Array, Floats
+from specimap_core.arrays import Array, Floats
 
 torch = pytest.importorskip("torch", reason="the packages of specimap[learned] are not installed")
 deformable = importlib.import_module("specimap_core.reconstruct.features.deformable")

@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from specimap_core.arrays import Floats
 from specimap_core.errors import CancelledError
-from specimap_core.geometry.cameras import Floats, Intrinsics
-from specimap_core.reconstruct.dense.depth_map import DepthMap, DepthSettings
+from specimap_core.geometry.cameras import Intrinsics
+from specimap_core.geometry.depth_map import DepthMap
 from specimap_core.reconstruct.dense.multi_view import dense_depth
+from specimap_core.reconstruct.dense.settings import DepthSettings
 from specimap_core.surface.refinement import pixel_footprint_mm
 from tests.support.matched_scene import Matched, matched
 from tests.support.true_depth import true_depth

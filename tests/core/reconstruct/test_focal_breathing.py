@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from specimap_core.arrays import Floats
 from specimap_core.bundle_adjust.solver import rms_px
 from specimap_core.fiducials.detection import detect_markers
 from specimap_core.fiducials.observations import Observations
-from specimap_core.geometry.cameras import Floats, Intrinsics, fit_similarity
+from specimap_core.geometry.cameras import Intrinsics, fit_similarity
 from specimap_core.photos.folder import photo_paths
 from specimap_core.photos.reading import AcquisitionSettings, Photo, read_photos, stated_focal_px
 from specimap_core.reconstruct.backend import CornersInPhotos, corners_in_photos, detect_in_photos

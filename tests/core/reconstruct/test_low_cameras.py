@@ -7,12 +7,13 @@ from functools import cache
 import numpy as np
 import pytest
 
+from specimap_core.arrays import Bytes, Floats
 from specimap_core.errors import DepthNotFoundError
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, View, look_at
+from specimap_core.geometry.cameras import Intrinsics, Pose, View, look_at
 from specimap_core.reconstruct.dense import multi_view
-from specimap_core.reconstruct.dense.depth_map import Bytes, DepthSettings
 from specimap_core.reconstruct.dense.multi_view import dense_depth
 from specimap_core.reconstruct.dense.pairs import choose_pairs
+from specimap_core.reconstruct.dense.settings import DepthSettings
 from specimap_core.reconstruct.dense.stereo import viewing_angles_deg
 from specimap_core.reconstruct.dense.volume import Volume, lattice_over, volume_over
 from specimap_core.surface.fusion import SurfaceSettings

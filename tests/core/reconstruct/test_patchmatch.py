@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from specimap_core.geometry.cameras import Intrinsics, Pose, View, look_at
 from specimap_core.reconstruct.dense import patchmatch
-from specimap_core.reconstruct.dense.depth_map import DepthSettings
 from specimap_core.reconstruct.dense.pairs import choose_pairs
 from specimap_core.reconstruct.dense.patchmatch_child import (
     WATCH_SECONDS,
@@ -24,6 +23,7 @@ from specimap_core.reconstruct.dense.patchmatch_child import (
     run,
     write_workspace,
 )
+from specimap_core.reconstruct.dense.settings import DepthSettings
 from specimap_core.reconstruct.dense.volume import Volume
 
 LENS = Intrinsics(200, 160, 300.0, 101.5, 77.25, 0.08, -0.02)

@@ -11,8 +11,9 @@ import numpy as np
 import pycolmap
 import pytest
 
+from specimap_core.arrays import Floats
 from specimap_core.errors import BackendFailedError, BackendUnavailableError, CancelledError
-from specimap_core.geometry.cameras import Floats
+from specimap_core.geometry.depth_map import DepthMap
 from specimap_core.notices import Notices
 from specimap_core.photos.folder import photo_paths
 from specimap_core.photos.reading import AcquisitionSettings, read_photos
@@ -20,8 +21,8 @@ from specimap_core.pipeline.outputs import Inputs
 from specimap_core.pipeline.run import run_pipeline
 from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.reconstruct.dense import patchmatch
-from specimap_core.reconstruct.dense.depth_map import DepthMap, DepthSettings
 from specimap_core.reconstruct.dense.multi_view import dense_depth
+from specimap_core.reconstruct.dense.settings import DepthSettings
 from specimap_core.reconstruct.dense.volume import volume_over
 from specimap_core.truth.judge import judge
 from specimap_validation.phantom import Phantom

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from specimap_core.arrays import Floats
 from specimap_core.bundle_adjust.solver import MarkerScene, rms_px, solve
 from specimap_core.errors import MarkerGeometryError
 from specimap_core.fiducials.observations import Observations, corners_of, square_corners
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, fit_similarity
+from specimap_core.geometry.cameras import Intrinsics, Pose, fit_similarity
 from specimap_core.reconstruct.backend import CornersInPhotos
 from specimap_core.reconstruct.false_markers import misread_ids, start_without_markers, without_markers
 from specimap_core.reconstruct.poses_from_markers import MarkerSolution, solve_from_markers

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from specimap_core.arrays import Singles
 from specimap_core.cloud import Cloud, Flag
 from specimap_core.cube import open_cube
 from specimap_core.geometry.cameras import fit_similarity
@@ -45,7 +45,6 @@ ALL, THREE = (0, 1, 2, 3), (0, 1, 2)
 SEEDS = range(8)
 RAISED_MM = 1.5
 MOVED_MM = (0.8, -0.5, 0.0)
-Image = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ def caster() -> RayCaster:
 
 
 @pytest.fixture(scope="module")
-def picture(caster: RayCaster) -> Image:
+def picture(caster: RayCaster) -> Singles:
     return seen(caster.mesh)
 
 
@@ -76,7 +75,7 @@ def off_mm(camera: CubeCamera) -> float:
     return float(np.sqrt((miss**2).sum(1).mean())) * camera.pixel_mm
 
 
-def case(image: Image, caster: RayCaster, ids: tuple[int, ...], noise_px: float, seed: int) -> Case:
+def case(image: Singles, caster: RayCaster, ids: tuple[int, ...], noise_px: float, seed: int) -> Case:
     """The markers ``ids`` with noise on their corners, and the cube's image of the bump."""
     noise = np.random.default_rng(seed).normal(0, noise_px, (len(CORNERS), 4, 2))
     pixels = (VIEW.project(CORNERS.reshape(-1, 3)).reshape(-1, 4, 2) + noise)[list(ids)]
@@ -93,7 +92,7 @@ def case(image: Image, caster: RayCaster, ids: tuple[int, ...], noise_px: float,
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_four_sharp_markers_hold_the_camera_and_the_specimen_agrees(
-    caster: RayCaster, picture: Image, seed: int
+    caster: RayCaster, picture: Singles, seed: int
 ) -> None:
     found = case(picture, caster, ALL, SHARP_PX, seed)
     refined = found.refined
@@ -107,7 +106,9 @@ def test_four_sharp_markers_hold_the_camera_and_the_specimen_agrees(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ids", [ALL, THREE])
-def test_what_markers_leave_open_the_specimen_settles(caster: RayCaster, picture: Image, ids: tuple[int, ...]) -> None:
+def test_what_markers_leave_open_the_specimen_settles(
+    caster: RayCaster, picture: Singles, ids: tuple[int, ...]
+) -> None:
     cases = [found for seed in SEEDS if (found := case(picture, caster, ids, BLURRED_PX, seed)).refined.specimen_used]
     # Corners that are off by chance hide at times how far: not every draw is recognised as loose.
     assert len(cases) >= 6
@@ -123,7 +124,7 @@ def test_what_markers_leave_open_the_specimen_settles(caster: RayCaster, picture
     assert 0.002 < after < 2 * SHARED_MM
 
 
-def test_what_nothing_settles_is_said(caster: RayCaster, picture: Image) -> None:
+def test_what_nothing_settles_is_said(caster: RayCaster, picture: Singles) -> None:
     blank = np.full_like(picture, 0.5)
     flat = RayCaster(bump_mesh(height_mm=0.1))
     for image, surface, seed in [(blank, caster, 0), (blank, caster, 1), (seen(flat.mesh), flat, 0)]:

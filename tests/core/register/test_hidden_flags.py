@@ -9,10 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from specimap_core.arrays import Flags, Floats
 from specimap_core.cloud import Cloud, Flag
-from specimap_core.geometry.cameras import Floats, fit_similarity
+from specimap_core.geometry.cameras import fit_similarity
 from specimap_core.pipeline.outputs import Inputs
 from specimap_core.pipeline.run import run_pipeline
 from specimap_core.pipeline.settings import PipelineSettings
@@ -26,7 +26,6 @@ from tests.support.scenes import xyz_image
 
 pytestmark = pytest.mark.slow
 
-Mask = NDArray[np.bool_]
 SEEDS = (3, 22)
 TILTED_DEG, UPRIGHT_DEG = 12.0, PhantomSettings().hsi_tilt_deg
 OFF_MM = 0.02
@@ -42,9 +41,9 @@ METHODS: tuple[Method, ...] = ("camera", "homography")
 class Hidden:
     """Pixels of a cube (rows, cols) with a point: those ``flagged``, and those whose place is hidden in ``truth``."""
 
-    placed: Mask
-    flagged: Mask
-    truth: Mask
+    placed: Flags
+    flagged: Flags
+    truth: Flags
 
 
 def runs(tilt_deg: float, folders: dict[int, Path]) -> dict[Method, list[Hidden]]:
@@ -99,7 +98,7 @@ def true_surface(truth: Truth) -> RayCaster:
     return RayCaster(Mesh(vertices, triangles, np.zeros_like(vertices), np.zeros(vertices.shape, np.uint8)))
 
 
-def behind_tissue(out: Path, truth: Truth) -> Mask:
+def behind_tissue(out: Path, truth: Truth) -> Flags:
     """Points (S,) of the cloud over which the true surface, seen from above, is hidden from the cube's true camera."""
     corners = json.loads((out / "corners.json").read_text(encoding="utf-8"))
     found = np.array([corners[str(i)] for i in truth.marker_ids]).reshape(-1, 3)
@@ -113,7 +112,7 @@ def behind_tissue(out: Path, truth: Truth) -> Mask:
     return surface.cast(place + OFF_MM * away, away).hit
 
 
-def under_tissue(out: Path, truth: Truth) -> Mask:
+def under_tissue(out: Path, truth: Truth) -> Flags:
     """Points (S,) of the cloud whose pixels truly look at places with tissue above."""
     pixels = Cloud.open(out / "cloud.zarr").hsi_pixel
     place = truth.hsi_xyz[pixels[:, 0], pixels[:, 1]].astype(float)
@@ -125,11 +124,11 @@ def vertical(points: Floats, z: float) -> Floats:
     return np.broadcast_to([0.0, 0.0, z], points.shape)
 
 
-def judged(out: Path, truth: Truth, flag: Flag, hidden: Mask) -> Hidden:
+def judged(out: Path, truth: Truth, flag: Flag, hidden: Flags) -> Hidden:
     cloud = Cloud.open(out / "cloud.zarr")
     pixels, shape = cloud.hsi_pixel, truth.hsi_class.shape
 
-    def image(values: Mask) -> Mask:
+    def image(values: Flags) -> Flags:
         drawn = np.zeros(shape, bool)
         drawn[pixels[:, 0], pixels[:, 1]] = values
         return drawn

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Array, Floats
 from specimap_core.errors import DuplicateMarkersError, MarkersMissingInCubeError, RegistrationError
 from specimap_core.fiducials.detection import dictionary_named
-from specimap_core.geometry.cameras import Array, Floats, Intrinsics, View, look_at
+from specimap_core.geometry.cameras import Intrinsics, View, look_at
 from specimap_core.register.camera_models import FOCAL_PRIOR_SD
 from specimap_core.register.cube_camera import solve_camera
 from specimap_core.register.cube_markers import find_markers, stretched

@@ -9,7 +9,7 @@ import pytest
 
 from specimap_core.errors import DepthNotFoundError
 from specimap_core.geometry.cameras import Intrinsics, Pose
-from specimap_core.reconstruct.dense.depth_map import DepthMap
+from specimap_core.geometry.depth_map import DepthMap
 from specimap_core.reconstruct.dense.volume import Volume, inside_volume
 from specimap_core.surface.fusion import SurfaceSettings, fuse
 

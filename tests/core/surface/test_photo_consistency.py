@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
+from specimap_core.arrays import Floats
+from specimap_core.geometry.cameras import Intrinsics, Pose
 from specimap_core.surface.fusion import Mesh
 from specimap_core.surface.photo_consistency import (
     HIGHLIGHT,

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Singles
 from specimap_core.surface.fusion import Mesh
 from specimap_core.surface.refinement import Refined, RefineSettings, refine_mesh
 from specimap_core.surface.uncertainty import (
@@ -30,7 +31,6 @@ from tests.support.matched_scene import matched
 
 pytestmark = pytest.mark.slow
 
-Singles = NDArray[np.float32]
 SHAPE = (24, 30)
 SEED = 31
 

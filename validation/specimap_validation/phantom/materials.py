@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from specimap_core.geometry.cameras import Floats
+from specimap_core.arrays import Floats
 
 MATERIALS = (
     "adipose",

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from specimap_core.geometry.cameras import Floats
-
-Floats32 = NDArray[np.float32]
+from specimap_core.arrays import Floats, Singles
 
 
 def band_noise(
     rng: np.random.Generator, shape: tuple[int, ...], shortest: float, longest: float, slope: float = 1.0
-) -> Floats32:
+) -> Singles:
     """Periodic Gaussian noise, zero mean, unit sd, of wavelengths from ``shortest`` to ``longest`` cells.
 
     Amplitude falls as frequency ** -slope. The edges of the band are soft.
@@ -48,14 +45,14 @@ class NoiseVolume:
         self._volume = band_noise(rng, (size,) * 3, 3, longest_mm / self._cell_mm, slope)
         self._axes = np.linalg.qr(rng.standard_normal((3, 3)))[0] / self._cell_mm
 
-    def __call__(self, points: Floats | Floats32) -> Floats32:
+    def __call__(self, points: Floats | Singles) -> Singles:
         """Values (N,) at points (N, 3) mm."""
         cells = points @ self._axes
         values = ndimage.map_coordinates(self._volume, cells.T, order=1, mode="grid-wrap", output=np.float32)
         return np.asarray(values, np.float32)
 
 
-def smoothstep(low: float, high: float, x: Floats | Floats32) -> Floats:
+def smoothstep(low: float, high: float, x: Floats | Singles) -> Floats:
     """0 below ``low``, 1 above ``high``, smooth between."""
     t = np.clip((x - low) / (high - low), 0, 1)
     return np.asarray(t * t * (3 - 2 * t))

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats, View
+from specimap_core.arrays import Floats, Singles
+from specimap_core.geometry.cameras import View
 from specimap_validation.phantom import materials
-from specimap_validation.phantom.noise import Floats32
 from specimap_validation.phantom.scene import BENCH, CARDS, KEY_LIGHTS, SPECIMEN, TRAY, Hits, Scene
 
 CLASS_NONE, CLASS_SPECIMEN, CLASS_CARD, CLASS_TRAY, CLASS_BENCH = range(5)
@@ -40,8 +40,8 @@ class Paint:
     ``vertex`` (V, C + 4): colour, irradiance and normal of the specimen's vertices.
     """
 
-    basis: Floats32
-    vertex: Floats32
+    basis: Singles
+    vertex: Singles
     shading: float
 
     @staticmethod
@@ -57,7 +57,7 @@ class Rendering:
     """``image`` (H, W, C) linear; of the ray through each pixel's centre: ``xyz`` (H, W, 3) mm, NaN for none,
     and ``classes`` (H, W) uint8."""
 
-    image: Floats32
+    image: Singles
     xyz: Floats
     classes: NDArray[np.uint8]
 
@@ -90,7 +90,7 @@ def _rays_per_pixel(surface: NDArray[np.int32], on_specimen: NDArray[np.bool_]) 
 
 def _sample(
     scene: Scene, view: View, paint: Paint, pixels: Floats, gloss: float
-) -> tuple[Floats32, Floats, NDArray[np.int32], NDArray[np.int32]]:
+) -> tuple[Singles, Floats, NDArray[np.int32], NDArray[np.int32]]:
     """Colour (S, C), point (S, 3), surface (S,) that distinguishes materials, geometry (S,); pixels (S, 2)."""
     colour = np.empty((len(pixels), paint.basis.shape[1]), np.float32)
     points = np.empty((len(pixels), 3))
@@ -103,7 +103,7 @@ def _sample(
 
 def _sample_block(
     scene: Scene, view: View, paint: Paint, pixels: Floats, gloss: float
-) -> tuple[Floats32, Floats, NDArray[np.int32], NDArray[np.int32]]:
+) -> tuple[Singles, Floats, NDArray[np.int32], NDArray[np.int32]]:
     eye = view.origins(pixels)
     directions = view.world_rays(pixels)
     hits = scene.caster.cast(eye, directions)
@@ -137,7 +137,7 @@ def _specimen_colour(
     points: Floats,
     directions: Floats,
     gloss: float,
-) -> Floats32:
+) -> Singles:
     corner = scene.specimen.triangles[hits.triangle[on]]
     u, v = hits.uv[on, :1], hits.uv[on, 1:]
     at = (1 - u - v) * paint.vertex[corner[:, 0]] + u * paint.vertex[corner[:, 1]] + v * paint.vertex[corner[:, 2]]
@@ -158,5 +158,5 @@ def _specimen_colour(
     return np.asarray(colour, np.float32)
 
 
-def _lit(irradiance: Floats32, paint: Paint) -> Floats32:
+def _lit(irradiance: Singles, paint: Paint) -> Singles:
     return np.asarray(1 + paint.shading * (irradiance - 1), np.float32)

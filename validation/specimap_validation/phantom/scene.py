@@ -9,9 +9,10 @@ import numpy as np
 from embreex import mesh_construction, rtcore_scene
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Floats, Singles
 from specimap_core.errors import SettingsError, UnknownDictionaryError
-from specimap_core.geometry.cameras import Floats, Pose, rotation_from_vector
-from specimap_validation.phantom.noise import Floats32, NoiseVolume, band_noise
+from specimap_core.geometry.cameras import Pose, rotation_from_vector
+from specimap_validation.phantom.noise import NoiseVolume, band_noise
 from specimap_validation.phantom.settings import PhantomSettings, Stream
 from specimap_validation.phantom.specimen import TRAY_Z_MM, Specimen, build_specimen, displaced
 
@@ -58,7 +59,7 @@ class Hits:
     distance: Floats
     geometry: NDArray[np.int32]
     triangle: NDArray[np.int32]
-    uv: Floats32
+    uv: Singles
 
 
 class RayCaster:
@@ -94,18 +95,18 @@ class Scene:
     caster: RayCaster
     detail: NoiseVolume
     texture_contrast: float
-    vertex_irradiance: Floats32
+    vertex_irradiance: Singles
     tray_half_mm: float
-    tray_maps: Floats32
+    tray_maps: Singles
     """(texels, texels, 2): share of speckle, irradiance; rows grow with y."""
     moved: Pose | None = None
     """From the specimen's place in the photos to its place here; None where it is the same."""
 
-    def detail_at(self, points: Floats) -> Floats32:
+    def detail_at(self, points: Floats) -> Singles:
         """Fine brightness detail (S,) of the tissue at points (S, 3) on the specimen; it moves with the tissue."""
         return self.detail(points if self.moved is None else self.moved.inverse().apply(points))
 
-    def tray_at(self, points: Floats) -> tuple[Floats32, Floats32]:
+    def tray_at(self, points: Floats) -> tuple[Singles, Singles]:
         """Share of speckle (S,) and irradiance (S,) on the tray under points (S, 3), S < 32768."""
         xy = ((points[:, :2] + self.tray_half_mm) * (_TRAY_TEXELS / (2 * self.tray_half_mm)) - 0.5).astype(np.float32)
         if not len(xy):
@@ -216,7 +217,7 @@ def sky() -> tuple[Floats, Floats]:
     return lights, weights / (weights * z).sum()
 
 
-def _irradiance(caster: RayCaster, points: Floats, normals: Floats, lights: Floats, weights: Floats) -> Floats32:
+def _irradiance(caster: RayCaster, points: Floats, normals: Floats, lights: Floats, weights: Floats) -> Singles:
     """Irradiance (S,) at points (S, 3) with normals (S, 3), shadows included."""
     start = points + 0.02 * normals
     # Light that the tray throws back keeps undersides from turning black.
@@ -230,7 +231,7 @@ def _irradiance(caster: RayCaster, points: Floats, normals: Floats, lights: Floa
     return total.astype(np.float32)
 
 
-def _tray_maps(settings: PhantomSettings, caster: RayCaster, half: float, lights: Floats, weights: Floats) -> Floats32:
+def _tray_maps(settings: PhantomSettings, caster: RayCaster, half: float, lights: Floats, weights: Floats) -> Singles:
     texel = 2 * half / _TRAY_TEXELS
     grain = band_noise(settings.rng(Stream.TRAY), (_TRAY_TEXELS,) * 2, 0.55 / texel, 5.0 / texel, 0.7)
     speckle = np.clip(0.4 + 0.3 * settings.texture_contrast * grain, 0, 1)

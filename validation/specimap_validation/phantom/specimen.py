@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from specimap_core.geometry.cameras import Floats, Pose, rotation_from_vector
+from specimap_core.arrays import Floats
+from specimap_core.geometry.cameras import Pose, rotation_from_vector
 from specimap_validation.phantom import materials
 from specimap_validation.phantom.noise import NoiseVolume, smoothstep
 from specimap_validation.phantom.settings import PhantomSettings, Stream

@@ -7,7 +7,8 @@ from functools import partial
 
 import numpy as np
 
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, View, look_at, rotation_from_vector
+from specimap_core.arrays import Floats
+from specimap_core.geometry.cameras import Intrinsics, Pose, View, look_at, rotation_from_vector
 from specimap_core.geometry.pushbroom import ScanView, WobblyScan
 from specimap_validation.phantom.settings import PhantomSettings, Stream
 

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Floats
 from specimap_core.atomic import atomic_path, write_text
 from specimap_core.errors import SettingsError
-from specimap_core.geometry.cameras import Floats
 from specimap_core.truth.truth_file import Truth, save_truth
 from specimap_validation.phantom.phantom import REFLECTANCE_SCALE, Phantom
 from specimap_validation.phantom.settings import PhantomSettings

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from specimap_core.arrays import Floats, Singles
 from specimap_core.fiducials.observations import Observations
-from specimap_core.geometry.cameras import Floats, View
+from specimap_core.geometry.cameras import View
 from specimap_core.geometry.robust import SIGMA_OF_MAD
-from specimap_core.reconstruct.dense.volume import Singles
 
 MARKER_STEPS = 6
 """Known places along a marker's edge: about as many on four markers as features on a specimen."""

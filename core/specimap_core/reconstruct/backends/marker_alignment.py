@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from specimap_core.arrays import Floats
 from specimap_core.errors import MarkerGeometryError, PhotosNotConnectedError
 from specimap_core.fiducials.layout import edge_lengths, marker_frame
 from specimap_core.fiducials.triangulation import triangulate
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, rotation_from_vector
+from specimap_core.geometry.cameras import Intrinsics, Pose, rotation_from_vector
 from specimap_core.reconstruct.backend import CornersInPhotos
 
 FOREIGN_SHARE_OF_WIDTH = 0.03

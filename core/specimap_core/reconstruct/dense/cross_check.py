@@ -8,9 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats, Pose, View
-from specimap_core.reconstruct.dense.depth_map import Bytes
-from specimap_core.reconstruct.dense.volume import Singles
+from specimap_core.arrays import Bytes, Floats, Singles
+from specimap_core.geometry.cameras import Pose, View
 
 SEEN_BEHIND = 4.0
 """A depth this many tolerances behind the other photo's is hidden there: that photo has no say."""

@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
+from specimap_core.arrays import Bytes, Floats
 from specimap_core.errors import DepthNotFoundError
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
-from specimap_core.reconstruct.dense.depth_map import Bytes, DepthMap, DepthSettings
+from specimap_core.geometry.cameras import Intrinsics, Pose
+from specimap_core.geometry.depth_map import DepthMap
 from specimap_core.reconstruct.dense.pairs import choose_pairs
+from specimap_core.reconstruct.dense.settings import DepthSettings
 from specimap_core.reconstruct.dense.stereo import antialiased, match_pair, shared_share, viewing_angles_deg
 from specimap_core.reconstruct.dense.volume import Volume
 

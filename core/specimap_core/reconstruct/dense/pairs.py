@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from specimap_core.geometry.cameras import Floats, Pose
-from specimap_core.reconstruct.dense.depth_map import DepthSettings
+from specimap_core.arrays import Floats
+from specimap_core.geometry.cameras import Pose
+from specimap_core.reconstruct.dense.settings import DepthSettings
 from specimap_core.reconstruct.dense.stereo import viewing_angles_deg
 
 

@@ -15,15 +15,17 @@ import cv2
 import numpy as np
 import pycolmap
 
+from specimap_core.arrays import Bytes, Floats, Singles
 from specimap_core.errors import BackendFailedError, BackendUnavailableError, DepthNotFoundError
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, View
+from specimap_core.geometry.cameras import Intrinsics, Pose, View
+from specimap_core.geometry.depth_map import DepthMap, cropped_map
 from specimap_core.notices import Notice, Notices
 from specimap_core.reconstruct.dense.cross_check import confirmed, nearest_photos, share_confirmed
-from specimap_core.reconstruct.dense.depth_map import Bytes, DepthMap, DepthSettings, cropped_map
 from specimap_core.reconstruct.dense.device import DENSE_DEVICE
 from specimap_core.reconstruct.dense.multi_view import dense_depth
 from specimap_core.reconstruct.dense.pairs import choose_pairs
-from specimap_core.reconstruct.dense.volume import Singles, Volume, inside_volume
+from specimap_core.reconstruct.dense.settings import DepthSettings
+from specimap_core.reconstruct.dense.volume import Volume, inside_volume
 from specimap_core.sandbox.process import run_child
 
 CHILD = Path(__file__).with_name("patchmatch_child.py")

@@ -12,8 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
-from specimap_core.reconstruct.dense.depth_map import Bytes, DepthMap, DepthSettings, cropped_map
+from specimap_core.arrays import Bytes, Floats
+from specimap_core.geometry.cameras import Intrinsics, Pose
+from specimap_core.geometry.depth_map import DepthMap, cropped_map
+from specimap_core.reconstruct.dense.settings import DepthSettings
 from specimap_core.reconstruct.dense.volume import Volume, inside_volume, lattice_over
 
 MOST_DISPARITIES = 512

@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
+from specimap_core.arrays import Floats, Singles
+from specimap_core.geometry.cameras import Intrinsics, Pose
 
 LATTICE = (13, 13, 5)
 """Points along x, y, z by which a box is sampled where a camera stands among its corners."""
-
-Singles = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Floats
 from specimap_core.errors import BackendUnavailableError
-from specimap_core.geometry.cameras import Floats
 from specimap_core.photos.reading import Photo
 from specimap_core.reconstruct.features.attention import fuse_attention
 from specimap_core.reconstruct.features.base import Features, Pairs, in_pool

@@ -10,7 +10,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import Floats
+from specimap_core.arrays import Floats
 from specimap_core.photos.reading import Photo
 
 Pairs = NDArray[np.int64]

@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
+from specimap_core.arrays import Array, Bytes, Floats, Singles
 from specimap_core.errors import BackendFailedError, DepthNotFoundError
-from specimap_core.geometry.cameras import Array, Floats, View
+from specimap_core.geometry.cameras import View
+from specimap_core.geometry.depth_map import DepthMap, cropped_map
 from specimap_core.notices import Notice
 from specimap_core.photos.reading import Photo
 from specimap_core.reconstruct.backend import (
@@ -26,8 +28,7 @@ from specimap_core.reconstruct.backends.da3.settings import NAME, PREFIX, Da3Set
 from specimap_core.reconstruct.backends.depth_alignment import LARGEST_SCATTER, align, depths_at, on_markers
 from specimap_core.reconstruct.backends.network_warnings import backend_run, depth_unaligned
 from specimap_core.reconstruct.dense.cross_check import confirmed, nearest_photos, share_confirmed
-from specimap_core.reconstruct.dense.depth_map import Bytes, DepthMap, cropped_map
-from specimap_core.reconstruct.dense.volume import Singles, Volume, inside_volume, volume_over
+from specimap_core.reconstruct.dense.volume import Volume, inside_volume, volume_over
 from specimap_core.reconstruct.poses import pose_photos
 from specimap_core.sandbox.process import Answer, run_child
 

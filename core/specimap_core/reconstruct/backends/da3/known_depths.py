@@ -6,11 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
+from specimap_core.arrays import Floats
+from specimap_core.geometry.cameras import Intrinsics, Pose
 from specimap_core.geometry.triangulation import triangulate_pair
 from specimap_core.photos.reading import Photo
-from specimap_core.reconstruct.dense.depth_map import DepthSettings
 from specimap_core.reconstruct.dense.pairs import choose_pairs
+from specimap_core.reconstruct.dense.settings import DepthSettings
 from specimap_core.reconstruct.features.base import Features
 from specimap_core.reconstruct.features.sift import Sift
 

@@ -8,10 +8,10 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose
+from specimap_core.arrays import Bytes, Floats
+from specimap_core.geometry.cameras import Intrinsics, Pose
 from specimap_core.reconstruct.backends.da3.settings import PATCH_PX
 from specimap_core.reconstruct.dense.cross_check import viewing_directions
-from specimap_core.reconstruct.dense.depth_map import Bytes
 from specimap_core.reconstruct.dense.stereo import antialiased
 
 

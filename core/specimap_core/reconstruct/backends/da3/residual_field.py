@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from specimap_core.geometry.cameras import Floats
+from specimap_core.arrays import Floats, Singles
 from specimap_core.geometry.robust import SIGMA_OF_MAD
 from specimap_core.reconstruct.backends.depth_alignment import NEAR
-from specimap_core.reconstruct.dense.volume import Singles
 
 REACH = 0.025
 """Sd of the kernel that spreads what known places show, as a share of the picture's longer side: 2 mm on a specimen."""

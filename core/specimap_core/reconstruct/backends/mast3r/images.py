@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from specimap_core.geometry.cameras import Floats, Intrinsics
+from specimap_core.arrays import Floats
+from specimap_core.geometry.cameras import Intrinsics
 
 PATCH_PX = 16
 

@@ -7,12 +7,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from specimap_core.arrays import Bytes, Floats, Singles
 from specimap_core.errors import DepthNotFoundError
-from specimap_core.geometry.cameras import Floats, Intrinsics
+from specimap_core.geometry.cameras import Intrinsics
+from specimap_core.geometry.depth_map import DepthMap, cropped_map
 from specimap_core.reconstruct.backends.mast3r.metric import Metric, Predicted
 from specimap_core.reconstruct.backends.mast3r.settings import PREFIX
-from specimap_core.reconstruct.dense.depth_map import Bytes, DepthMap, cropped_map
-from specimap_core.reconstruct.dense.volume import Singles, inside_volume, volume_over
+from specimap_core.reconstruct.dense.volume import inside_volume, volume_over
 
 EDGE_SHARE = 0.01
 """Neighbouring depths that differ by more than this share are two surfaces: nothing is interpolated between them."""

@@ -14,13 +14,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from specimap_core.arrays import Floats, Singles
 from specimap_core.bundle_adjust.adjust import Adjusted, AdjustSettings, adjust
-from specimap_core.geometry.cameras import Floats, Intrinsics, Pose, View, rotation_from_vector
+from specimap_core.geometry.cameras import Intrinsics, Pose, View, rotation_from_vector
 from specimap_core.reconstruct.backend import CornersInPhotos
 from specimap_core.reconstruct.backends.depth_alignment import Alignment, align, depths_at, on_markers
 from specimap_core.reconstruct.backends.marker_alignment import AlignedCameras
 from specimap_core.reconstruct.backends.mast3r.images import Preparation
-from specimap_core.reconstruct.dense.volume import Singles
 
 POINTS_PER_PHOTO = 400
 LEAST_POINTS = 200
