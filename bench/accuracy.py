@@ -88,16 +88,16 @@ def bench_accuracy(console: Console, work: Path, repeats: int) -> dict[str, obje
         camera = judge(out, case.folder)
         _measured(photos, case, out, "homography")
         flat = judge(out, case.folder)
-        said = run.result
+        output = run.result
         table.add_row(
             case.name,
-            f"{said['photos'][0]} of {said['photos'][1]}",
+            f"{output['photos'][0]} of {output['photos'][1]}",
             f"{camera.median:.3f}",
             f"{camera.p95:.3f}",
             f"{100 * camera.coverage:.1f} %",
             f"{100 * camera.scale:+.2f} %",
-            f"{said['corner_2d_mm']:.3f}",
-            f"{said['corner_3d_mm']:.3f}",
+            f"{output['corner_2d_mm']:.3f}",
+            f"{output['corner_3d_mm']:.3f}",
             f"{flat.median:.3f} / {flat.p95:.3f}",
             f"{run.whole.wall_s:.1f}",
         )
@@ -105,7 +105,7 @@ def bench_accuracy(console: Console, work: Path, repeats: int) -> dict[str, obje
             "camera": _figures(camera),
             "homography": _figures(flat),
             "seconds": run.whole.wall_s,
-            "report": said,
+            "report": output,
         }
     console.print(table)
     if data is None:

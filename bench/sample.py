@@ -1,4 +1,4 @@
-"""The whole run on the sample, stage by stage, beside what is published."""
+"""The whole run on the sample, stage by stage, compared with what is published."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ def bench_sample(console: Console, work: Path, repeats: int) -> dict[str, object
     table.add_section()
     table.add_row("whole", *_cells(best.whole), "-")
     console.print(table)
-    said = best.result
+    output = best.result
     console.print(
-        f"2D corner error {said['corner_2d_mm']:.3f} mm (published {CORNER_2D_WORDS}), "
-        f"3D {said['corner_3d_mm']:.3f} mm (published {CORNER_3D_WORDS}).\n"
+        f"2D corner error {output['corner_2d_mm']:.3f} mm (published {CORNER_2D_WORDS}), "
+        f"3D {output['corner_3d_mm']:.3f} mm (published {CORNER_3D_WORDS}).\n"
         "Peak: memory of the process beyond mapped files and libraries.",
         highlight=False,
     )

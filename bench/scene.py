@@ -1,4 +1,4 @@
-"""A finished reconstruction beside its truth, for what the parts of the way add to the error."""
+"""A finished reconstruction with its truth, for what the parts of the way add to the error."""
 
 from __future__ import annotations
 

@@ -132,8 +132,8 @@ def sheet_sigma(figures: dict[str, Any]) -> Sheet:
     for role in ROLES:
         for name, (median, one, two) in figures[role].items():
             sheet.rows.append([name, role, f"{median:.3f}", f"{100 * one:.1f} %", f"{100 * two:.1f} %"])
-    for said, shares in (("Numbers that suit the first best", figures["fitted"]), ("In force", figures["in_force"])):
-        sheet.notes.append(f"{said}: {', '.join(f'`{name}` {value:.4g}' for name, value in shares.items())}.")
+    for output, shares in (("Numbers that suit the first best", figures["fitted"]), ("In force", figures["in_force"])):
+        sheet.notes.append(f"{output}: {', '.join(f'`{name}` {value:.4g}' for name, value in shares.items())}.")
     return sheet
 
 

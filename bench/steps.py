@@ -1,4 +1,4 @@
-"""Where a run's seconds go: each step's share, beside what its libraries alone would take."""
+"""Where a run's seconds go: each step's share, compared with what its libraries alone would take."""
 
 from __future__ import annotations
 

@@ -79,11 +79,11 @@ def accuracy_table(figures: dict[str, Any]) -> str:
         if name == REAL:
             continue
         used, given = case["report"]["photos"]
-        flat, best, said = case["homography"], case["camera"], case["report"]
+        flat, best, output = case["homography"], case["camera"], case["report"]
         rows.append(
             f"| {name} | {used} of {given} | {best['median_mm']:.3f} | {best['p95_mm']:.3f} "
-            f"| {100 * best['coverage']:.2f} % | {100 * best['scale']:+.2f} % | {said['corner_2d_mm']:.3f} "
-            f"| {said['corner_3d_mm']:.3f} | {flat['median_mm']:.3f}, {flat['p95_mm']:.3f} |"
+            f"| {100 * best['coverage']:.2f} % | {100 * best['scale']:+.2f} % | {output['corner_2d_mm']:.3f} "
+            f"| {output['corner_3d_mm']:.3f} | {flat['median_mm']:.3f}, {flat['p95_mm']:.3f} |"
         )
     return "\n".join(rows)
 

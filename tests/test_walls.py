@@ -45,7 +45,7 @@ FEATURE_IMPORTS = {
 }
 """Features of the service, and which others each may import."""
 SHARED_IMPORTS = {"health": {"auth"}, "body_limits": {"auth"}, "app": set(FEATURE_IMPORTS)}
-"""Modules beside the features that may import some; all others import none."""
+"""Modules next to the features that may import some; all others import none."""
 HEAVY = ("cv2", "open3d", "pycolmap", "embreex", "scipy", "torch")
 LIGHT = (
     "specimap_core.cloud",

@@ -1,4 +1,4 @@
-"""Jobs of the sample through the service with a worker: what they take beside their stages, and how long they wait."""
+"""Jobs of the sample through the service with a worker: what they take besides their stages, and how long they wait."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Other servers on the same files: nginx, the bar for whoever sends bytes; Tiled, which serves arrays over HTTP.
+"""Other servers on the same files: nginx, which only sends bytes; Tiled, which serves arrays over HTTP.
 
 Both are found in PATH, are started on a free port with all they write in a folder of their own, and are left out where
 they are missing.
@@ -64,8 +64,8 @@ def nginx_version() -> str | None:
     program = _nginx()
     if program is None:
         return None
-    said = subprocess.run([program, "-v"], capture_output=True, text=True, check=False).stderr
-    return said.rpartition("/")[2].strip()
+    output = subprocess.run([program, "-v"], capture_output=True, text=True, check=False).stderr
+    return output.rpartition("/")[2].strip()
 
 
 @contextmanager
@@ -114,8 +114,8 @@ def tiled_version() -> str | None:
     program = shutil.which("tiled")
     if program is None:
         return None
-    said = subprocess.run([program, "--version"], capture_output=True, text=True, check=False).stdout
-    return said.strip().rpartition(" ")[2]
+    output = subprocess.run([program, "--version"], capture_output=True, text=True, check=False).stdout
+    return output.strip().rpartition(" ")[2]
 
 
 @contextmanager

@@ -95,17 +95,17 @@ def serving(folder: Path, *, worker: bool = False) -> Iterator[Served]:
     hung = threading.Timer(START_SECONDS, process.kill)
     hung.start()
     try:
-        said, output = "", process.stdout
+        printed, output = "", process.stdout
         assert output is not None
         for line in output:
-            said += line
-            if re.search(r"^spk_\S+$", said, re.MULTILINE):
+            printed += line
+            if re.search(r"^spk_\S+$", printed, re.MULTILINE):
                 break
         hung.cancel()
-        url, key = re.search(r"listens on (http://\S+)", said), re.search(r"^spk_\S+$", said, re.MULTILINE)
+        url, key = re.search(r"listens on (http://\S+)", printed), re.search(r"^spk_\S+$", printed, re.MULTILINE)
         if url is None or key is None:
             process.wait()
-            raise RuntimeError(f"specimap serve does not start:\n{said}{log.read_text(encoding='utf-8')[-2000:]}")
+            raise RuntimeError(f"specimap serve does not start:\n{printed}{log.read_text(encoding='utf-8')[-2000:]}")
         yield Served(url[1], key[0], process.pid, folder)
     finally:
         hung.cancel()

@@ -1,4 +1,4 @@
-"""A stored shard over HTTP, whole and in ranges, beside nginx with the same file and the same client."""
+"""A stored shard over HTTP, whole and in ranges; nginx serves the same file to the same client."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def bench_shard(work: Path, options: Options) -> dict[str, Any]:
 
 
 def sheet_shard(figures: dict[str, Any]) -> list[Sheet]:
-    """MB/s beside nginx's."""
+    """MB/s, and nginx's."""
     sheet = Sheet(
         f"A shard of {figures['bytes'] / 1e6:.0f} MB over HTTP, fastest run",
         ("request", "MB/s", "nginx MB/s", "of nginx's", "wanted", "met", "p50 ms", "API CPU s/GB"),

@@ -1,4 +1,4 @@
-"""Cubes up by resumable upload and down again, beside nginx; and the memory of the API's process meanwhile."""
+"""Cubes up by resumable upload and down again, compared with nginx; and the memory of the API's process meanwhile."""
 
 from __future__ import annotations
 

@@ -92,9 +92,9 @@ def _shield_words(shield: Protection) -> str:
 
 def _with(part: Usable) -> list[str]:
     modules: dict[str, str] = part.facts.get("modules", {})
-    said = [f"{name} {modules[name]}".strip() for name in SHOWN_MODULES if name in modules]
+    output = [f"{name} {modules[name]}".strip() for name in SHOWN_MODULES if name in modules]
     weights: dict[str, Any] | None = part.facts.get("weights")
     if weights:
         pinned = "as pinned" if weights["pinned"] else "not pinned"
-        said.append(f"weights of {weights['bytes'] / GIB:.2f} GiB, sha256 {weights['sha256'][:12]}, {pinned}")
-    return said
+        output.append(f"weights of {weights['bytes'] / GIB:.2f} GiB, sha256 {weights['sha256'][:12]}, {pinned}")
+    return output

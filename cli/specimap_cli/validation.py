@@ -1,4 +1,4 @@
-"""``specimap study subsampling`` and ``specimap validate``: what the figures rest on, for whoever doubts them."""
+"""``specimap study subsampling`` and ``specimap validate``: the figures measured anew."""
 
 from __future__ import annotations
 

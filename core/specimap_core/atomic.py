@@ -41,7 +41,7 @@ def disk_errors(path: Path) -> Iterator[None]:
 
 @contextmanager
 def atomic_path(target: Path) -> Iterator[Path]:
-    """A path beside ``target`` to write a file or folder to; renamed onto ``target`` when the block succeeds.
+    """A path next to ``target`` to write a file or folder to; renamed onto ``target`` when the block succeeds.
 
     An existing file or folder at ``target`` is replaced. On failure what was written aside is removed.
     """

@@ -130,13 +130,13 @@ class CubeTruncatedError(SpecimapError, ValueError):
 
 
 class CubeNotFoundError(SpecimapError, FileNotFoundError):
-    """The cube, or the data beside its header, does not exist."""
+    """The cube, or the data next to its header, does not exist."""
 
     code = "cube_not_found"
 
 
 class CubeNotReadableError(SpecimapError, PermissionError):
-    """The cube, or the data beside its header, may not be read by this user; details hold the path."""
+    """The cube, or the data next to its header, may not be read by this user; details hold the path."""
 
     code = "cube_not_readable"
 

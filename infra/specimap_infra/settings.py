@@ -184,7 +184,7 @@ class ServiceSettings(BaseSettings):
         if not self.storage_place.startswith("s3://"):
             places.append(Path(self.storage_place))
         if self.database.startswith("sqlite:///"):
-            # With its journals, which come and go beside it.
+            # With its journals, which come and go next to it.
             places.append(Path(self.database.removeprefix("sqlite:///")).parent)
         if self._config_file is not None:
             places.append(self._config_file)

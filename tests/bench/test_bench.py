@@ -183,14 +183,14 @@ def test_every_bound_is_of_a_step() -> None:
 
 
 def test_imports_are_summed_by_whose_they_are() -> None:
-    said = (
+    output = (
         "import time: self [us] | cumulative | imported package\n"
         "import time:      1000 |       1000 |   numpy.linalg\n"
         "import time:      2000 |       3000 | specimap_core\n"
         "a warning | 7 | of something else\n"
         "import time:       500 |        500 | specimapper\n"
     )
-    assert imports_in(said) == pytest.approx({"all": 0.0035, "outside": 0.0015})
+    assert imports_in(output) == pytest.approx({"all": 0.0035, "outside": 0.0015})
 
 
 def test_the_exponent_of_a_power_is_that_power_and_a_fixed_cost_lowers_it() -> None:
@@ -268,6 +268,6 @@ def test_a_table_of_the_page_says_what_it_was_measured_on() -> None:
     skipped = {"rows": 2, "cols": 4, "bytes": 3_000_000_000, "skipped": "no room"}
     machine = {"cores": 3, "cpu": "a processor", "memory_gb": 5, "python": "3.11", "load_before": 0.5}
     figures = {"repeats": 1, "sizes": {"4": skipped}, "load_after": 0.75}
-    said = run_tables("growth", {"figures": figures, "machine": machine, "time": "2026-01-02T03:04:05+00:00"})
-    assert "| 4 | 4 x 2 | 3.00 | - | - | - | - | - | - |" in said
-    assert said.endswith("3 x a processor, 5 GB, Python 3.11, load 0.5 before, 0.75 after; 2026-01-02.")
+    output = run_tables("growth", {"figures": figures, "machine": machine, "time": "2026-01-02T03:04:05+00:00"})
+    assert "| 4 | 4 x 2 | 3.00 | - | - | - | - | - | - |" in output
+    assert output.endswith("3 x a processor, 5 GB, Python 3.11, load 0.5 before, 0.75 after; 2026-01-02.")

@@ -61,9 +61,9 @@ def test_what_is_there_and_what_is_missing(bare: pytest.MonkeyPatch) -> None:
     assert "open3d" in part_of(answer, "colmap")["facts"]["modules"]
     mast3r = part_of(answer, "mast3r")
     assert mast3r["usable"] is False
-    said = [m["what"] + m["do"] for m in mast3r["missing"]]
-    assert any("SPECIMAP_MAST3R_HOME" in s for s in said)
-    assert any("SPECIMAP_MAST3R_WEIGHTS" in s for s in said)
+    output = [m["what"] + m["do"] for m in mast3r["missing"]]
+    assert any("SPECIMAP_MAST3R_HOME" in s for s in output)
+    assert any("SPECIMAP_MAST3R_WEIGHTS" in s for s in output)
     assert "non-commercial" in mast3r["licence"]
     assert part_of(answer, "da3")["usable"] is False
     assert any("SPECIMAP_DA3_WEIGHTS" in m["do"] for m in part_of(answer, "da3")["missing"])
@@ -87,9 +87,9 @@ def test_checkout_weights_and_interpreter_are_looked_at(tmp_path: Path, bare: py
     assert "scipy" in found["facts"]["modules"]
     bare.setenv("SPECIMAP_MAST3R_WEIGHTS_SHA256", "0" * 64)
     bare.setenv("SPECIMAP_MAST3R_PYTHON", "/nowhere/python")
-    said = [m["what"] for m in part_of(json.loads(ask("--json")[1]), "mast3r")["missing"]]
-    assert any("not the pinned one" in s for s in said)
-    assert any("/nowhere/python" in s for s in said)
+    output = [m["what"] for m in part_of(json.loads(ask("--json")[1]), "mast3r")["missing"]]
+    assert any("not the pinned one" in s for s in output)
+    assert any("/nowhere/python" in s for s in output)
 
 
 def test_a_setting_that_does_not_read_is_told(bare: pytest.MonkeyPatch) -> None:

@@ -142,10 +142,12 @@ def test_a_pdf(finished: Finished, tmp_path: Path) -> None:
 def test_what_the_pdf_says(finished: Finished, tmp_path: Path) -> None:
     target = tmp_path / "r.pdf"
     assert command(finished.out, "--format", "pdf", "--target", target).status == 0
-    told = subprocess.run(["pdftotext", "-layout", target, "-"], capture_output=True, text=True, check=True, timeout=60)
-    text = " ".join(told.stdout.split())
+    described = subprocess.run(
+        ["pdftotext", "-layout", target, "-"], capture_output=True, text=True, check=True, timeout=60
+    )
+    text = " ".join(described.stdout.split())
     report = finished.report
-    for said in (
+    for output in (
         "Accuracy report",
         "Verdict",
         "Not a medical device",
@@ -157,7 +159,7 @@ def test_what_the_pdf_says(finished: Finished, tmp_path: Path) -> None:
         report.photos.used[-1],
         "adjust.edge_mm",
     ):
-        assert said in text
+        assert output in text
 
 
 def test_what_is_refused(finished: Finished, small: OnDisk, tmp_path: Path) -> None:

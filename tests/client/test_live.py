@@ -144,9 +144,9 @@ def test_job_is_submitted_followed_and_run_again(live: Live) -> None:
     done = jobs.wait(job, progress=listen, timeout=60)
     worker.join(timeout=60)
     assert (done.state, done.seconds) == ("succeeded", {"render": 1.0})
-    told = [(now.state, now.stage, now.progress) for now in heard]
-    assert [told[0], told[-1]] == [("queued", None, 0.0), ("succeeded", "render", 1.0)]
-    assert ("running", "render", 0.5) in told
+    described = [(now.state, now.stage, now.progress) for now in heard]
+    assert [described[0], described[-1]] == [("queued", None, 0.0), ("succeeded", "render", 1.0)]
+    assert ("running", "render", 0.5) in described
     assert [event.type for event in jobs.events(job, after=2)] == ["progress", "progress", "progress", "log", "state"]
     (line,) = jobs.log(job)
     assert (line.level, line.message, line.data) == ("info", "photos refused", {"count": 2})

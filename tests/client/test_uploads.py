@@ -167,9 +167,9 @@ def test_file_that_shrinks_or_arrives_changed_is_told(tmp_path: Path, waits: lis
     def changing(request: httpx.Request) -> httpx.Response:
         answer = TusService.__call__(service, request)
         if request.url.path.endswith("/result"):
-            told = json.loads(answer.content)
-            told["file"]["sha256"] = "0" * 64
-            return httpx.Response(200, json=told)
+            described = json.loads(answer.content)
+            described["file"]["sha256"] = "0" * 64
+            return httpx.Response(200, json=described)
         return answer
 
     with client_of(changing) as client, pytest.raises(sc.UploadFailed) as caught:

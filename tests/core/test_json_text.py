@@ -176,10 +176,10 @@ def test_commands_on_a_folder_without_figures_print_json(empty: Report, tmp_path
     assert strictly(answer.out)["corner_2d_mm"]["mean"] is None
     assert specimap("info", out).status == 0
     for format in ("csv", "npz"):
-        said = specimap("export", out, "--format", format, "--json")
-        assert strictly(said.out)["event"] == "exported"
-    said = specimap("report", out, "--json")
-    assert strictly(said.out)["event"] == "reported"
+        output = specimap("export", out, "--format", format, "--json")
+        assert strictly(output.out)["event"] == "exported"
+    output = specimap("report", out, "--json")
+    assert strictly(output.out)["event"] == "reported"
     with np.load(out / "cloud.npz") as stored:
         strictly(str(stored["attributes"]))
     strictly((out / "cloud.zarr" / "zarr.json").read_text("utf-8"))

@@ -1,4 +1,4 @@
-"""Open3D is loaded beside other imports, and what is wrong with it is said."""
+"""Open3D loads while other threads import, and a failure is reported."""
 
 from __future__ import annotations
 

@@ -51,8 +51,8 @@ def test_life_of_a_job_is_told_in_events(tables: Database) -> None:
     assert job.started_at is not None
     assert job.finished_at is not None
     assert job.created_at <= job.started_at <= job.finished_at
-    told = [(e.seq, e.type, e.data) for e in events(tables, job_id)]
-    assert told == [
+    described = [(e.seq, e.type, e.data) for e in events(tables, job_id)]
+    assert described == [
         (1, "state", {"state": "queued", "starts": 0}),
         (2, "state", {"state": "running", "starts": 1}),
         (3, "progress", {"stage": "render", "progress": 0.25}),
@@ -116,11 +116,11 @@ def test_worker_that_lost_the_job_changes_nothing(
             jobs.release(session, job_id)
         if how == "taken over":
             jobs.claim(session, job_id, "host:1:two")
-    before, told = row(tables, job_id), [e.seq for e in events(tables, job_id)]
+    before, described = row(tables, job_id), [e.seq for e in events(tables, job_id)]
     with pytest.raises((LostLeaseError, JobConflictError)), tables.session() as session:
         write(session, job_id)
     after = row(tables, job_id)
-    assert [e.seq for e in events(tables, job_id)] == told
+    assert [e.seq for e in events(tables, job_id)] == described
     for column in Job.__table__.columns:
         assert getattr(after, column.name) == getattr(before, column.name)
     with tables.session() as session:
@@ -173,10 +173,12 @@ def test_writers_at_once_number_events_without_a_gap(tables: Database) -> None:
 
     with ThreadPoolExecutor(6) as pool:
         list(pool.map(write, range(6)))
-    told = events(tables, job_id)
-    assert [e.seq for e in told] == list(range(1, 63))
+    described = events(tables, job_id)
+    assert [e.seq for e in described] == list(range(1, 63))
     for writer in range(6):
-        assert [e.data["data"]["n"] for e in told if e.data.get("data", {}).get("writer") == writer] == list(range(10))
+        assert [e.data["data"]["n"] for e in described if e.data.get("data", {}).get("writer") == writer] == list(
+            range(10)
+        )
 
 
 def test_one_of_many_ends_wins(tables: Database) -> None:

@@ -116,15 +116,15 @@ def test_delivery_is_signed_and_carries_the_job(
     assert int(before.timestamp()) <= int(at) <= utc_now().timestamp()
     assert headers["x-specimap-delivery"] == delivery_id
     assert headers["content-type"] == "application/json"
-    told = json.loads(body)
-    assert (told["event"], told["job"]["state"], told["job"]["seconds"]) == (
+    described = json.loads(body)
+    assert (described["event"], described["job"]["state"], described["job"]["seconds"]) == (
         "job.succeeded",
         "succeeded",
         {"adjust": 1.5},
     )
-    assert before <= datetime.datetime.fromisoformat(told["delivered_at"]) <= utc_now()
+    assert before <= datetime.datetime.fromisoformat(described["delivered_at"]) <= utc_now()
     assert SECRET not in body.decode()
-    assert "webhook" not in told["job"]
+    assert "webhook" not in described["job"]
     row = delivery(tables, delivery_id)
     assert (row.state, row.attempts, row.last_status) == ("delivered", 1, "200")
 
@@ -260,8 +260,8 @@ def test_host_is_checked_when_the_job_is_made(tmp_path: Path, receiver: Receiver
         for job_id in (job.json()["id"], again, silent):
             api.post(f"/v1/jobs/{job_id}/cancel")
         assert deliver_due(service.database, service.settings, client) == 2
-    told = [json.loads(body) for _, body in receiver.got]
-    assert {(t["event"], t["job"]["id"]) for t in told} == {
+    described = [json.loads(body) for _, body in receiver.got]
+    assert {(t["event"], t["job"]["id"]) for t in described} == {
         ("job.cancelled", job.json()["id"]),
         ("job.cancelled", again),
     }

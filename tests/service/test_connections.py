@@ -38,13 +38,13 @@ def connected(service: Running) -> socket.socket:
 
 def answered(connection: socket.socket) -> bytes:
     """All that comes until the other side ends."""
-    said = b""
+    output = b""
     try:
         while piece := connection.recv(65536):
-            said += piece
+            output += piece
     except ConnectionError:
         pass
-    return said
+    return output
 
 
 @pytest.mark.parametrize("what", ENDLESS)
@@ -68,9 +68,9 @@ def test_the_refusal_says_why(shared: Running) -> None:
         for piece in (*[PIECE] * (LARGEST_HEAD // len(PIECE)), b"a"):
             time.sleep(0.05)
             connection.sendall(piece)
-        said = answered(connection)
-    assert said.startswith(b"HTTP/1.1 400 ")
-    assert said.endswith(b"The request's headers are too large.")
+        output = answered(connection)
+    assert output.startswith(b"HTTP/1.1 400 ")
+    assert output.endswith(b"The request's headers are too large.")
 
 
 def test_an_honest_head_is_read_however_it_comes(shared: Running) -> None:

@@ -96,8 +96,8 @@ def test_every_body_has_an_example(contract: dict[str, Any]) -> None:
         if body is not None:
             given = (body["schema"], *body["schema"].get("anyOf", []))
             names = [s["$ref"].rsplit("/", 1)[-1] for s in given if "$ref" in s]
-            said = {*body, *body["schema"], *(word for name in names for word in schemas[name])}
-            assert {"example", "examples"} & said, f"{method} {path}"
+            output = {*body, *body["schema"], *(word for name in names for word in schemas[name])}
+            assert {"example", "examples"} & output, f"{method} {path}"
 
 
 @pytest.mark.slow

@@ -125,7 +125,7 @@ def shows_secret(file: dict[str, Any]) -> bool:
 
 @dataclass(frozen=True)
 class Beside:
-    """A service in a folder, and beside it the secrets by the kind of file that leads to them."""
+    """A service in a folder, and next to it the secrets by the kind of file that leads to them."""
 
     folder: Path
     service: Running

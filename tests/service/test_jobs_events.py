@@ -73,17 +73,17 @@ def until(condition: Callable[[], bool], seconds: float = 15) -> None:
 def test_stream_tells_all_from_the_start_and_ends(service: Running) -> None:
     job_id = queued_job(service.database)
     client = service.client(["read"])
-    with following(client, job_id) as told:
-        first = next(told)
+    with following(client, job_id) as described:
+        first = next(described)
         assert first == (1, "state", {"state": "queued", "starts": 0})
         worker = threading.Thread(target=work, args=(service.database, job_id, 10, 0.05))
         worker.start()
-        seen = [first, *told]
+        seen = [first, *described]
         worker.join()
     assert [(seq, type) for seq, type, _ in seen] == expected(10)
     assert seen[-1][2] == {"state": "succeeded", "error": None, "cloud_id": None}
-    with following(client, job_id) as told:
-        assert list(told) == seen
+    with following(client, job_id) as described:
+        assert list(described) == seen
 
 
 def test_stream_is_resumed_after_the_last_event_seen(service: Running) -> None:
@@ -94,9 +94,9 @@ def test_stream_is_resumed_after_the_last_event_seen(service: Running) -> None:
     seen: list[Told] = []
     while not seen or seen[-1][1] != "state" or seen[-1][2]["state"] != "succeeded":
         headers = {"Last-Event-ID": str(seen[-1][0])} if seen else {}
-        with following(client, job_id, headers) as told:
+        with following(client, job_id, headers) as described:
             # The connection breaks after some events.
-            for _, event in zip(range(7), told, strict=False):
+            for _, event in zip(range(7), described, strict=False):
                 seen.append(event)
     worker.join()
     assert [(seq, type) for seq, type, _ in seen] == expected(60)
@@ -124,10 +124,10 @@ def test_many_listeners_cost_one_look_into_the_database(service: Running, monkey
     client = service.client(["read"])
 
     def listen(n: int) -> list[Told]:
-        with following(client, ids[n % 3]) as told:
-            first = next(told)
+        with following(client, ids[n % 3]) as described:
+            first = next(described)
             started.wait()
-            return [first, *told]
+            return [first, *described]
 
     with ThreadPoolExecutor(listeners) as pool, httpx.Client(trust_env=False) as stranger:
         listening = [pool.submit(listen, n) for n in range(listeners)]
@@ -138,9 +138,9 @@ def test_many_listeners_cost_one_look_into_the_database(service: Running, monkey
             for job_id in ids:
                 workers.submit(work, service.database, job_id, 20, 0.05)
             assert stranger.get(f"{service.url}/healthz").status_code == 200
-        told = [done.result(timeout=30) for done in listening]
+        described = [done.result(timeout=30) for done in listening]
         seconds = time.monotonic() - begun
-    for seen in told:
+    for seen in described:
         assert [(seq, type) for seq, type, _ in seen] == expected(20)
     assert len(looks) <= seconds / events.POLL_SECONDS + 4
     feed: events.JobEvents = service.app.state.job_events
@@ -183,8 +183,8 @@ def test_stream_lives_through_an_outage_of_the_database(tmp_path: Path) -> None:
         name = sql.Identifier(url.rsplit("/", 1)[1])
         job_id = queued_job(service.database)
         client = service.client(["read"])
-        with following(client, job_id) as told:
-            assert next(told)[0] == 1
+        with following(client, job_id) as described:
+            assert next(described)[0] == 1
             server.execute(sql.SQL("ALTER DATABASE {} ALLOW_CONNECTIONS false").format(name))
             server.execute(
                 "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = %s", [url.rsplit("/", 1)[1]]
@@ -195,4 +195,4 @@ def test_stream_lives_through_an_outage_of_the_database(tmp_path: Path) -> None:
             until(lambda: time.monotonic() > over)
             server.execute(sql.SQL("ALTER DATABASE {} ALLOW_CONNECTIONS true").format(name))
             work(service.database, job_id, 3)
-            assert [(seq, type) for seq, type, _ in told] == expected(3)[1:]
+            assert [(seq, type) for seq, type, _ in described] == expected(3)[1:]

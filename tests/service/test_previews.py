@@ -192,11 +192,11 @@ def test_probabilities_as_a_colour_scale(client: httpx.Client, result: Result) -
     chances[:, 1] = 1
     chances[7] = np.nan
     put_label(client, result, {"kind": "probability", "classes": classes}, chances)
-    said = np.arange(cloud.n_points) != 7
+    output = np.arange(cloud.n_points) != 7
     for asked, colour in (({}, (68, 1, 84)), ({"class": "4"}, (253, 231, 37))):
         answer = client.get(previews(result, "label"), params={"name": "tissue", **asked})
         shown = at_points(picture(answer), cloud).astype(float)
-        expected = dimmed(cloud)[:, None] + (1 - pictures.DIM) * np.array(colour) * said[:, None]
+        expected = dimmed(cloud)[:, None] + (1 - pictures.DIM) * np.array(colour) * output[:, None]
         assert np.abs(shown - expected).max() <= 1
         assert answer.headers["x-specimap-range"] == "0,1"
     unknown = client.get(previews(result, "label"), params={"name": "tissue", "class": 2})

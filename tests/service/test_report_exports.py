@@ -47,9 +47,9 @@ def made(service: Running, client: httpx.Client, result: Result, format: str) ->
     asked = client.post(address(result, format))
     assert asked.status_code == 202
     make(service, asked.json()["id"])
-    told = client.get(address(result, format)).json()
-    assert (told["state"], told["error"]) == ("succeeded", None), told
-    return client.get(told["links"]["content"])
+    described = client.get(address(result, format)).json()
+    assert (described["state"], described["error"]) == ("succeeded", None), described
+    return client.get(described["links"]["content"])
 
 
 @pytest.mark.slow
@@ -94,15 +94,15 @@ def test_a_stored_report_that_is_damaged(service: Running, client: httpx.Client,
     service.storage.put(f"{result.prefix}/report.json", b"{}")
     asked = client.post(address(result, "pdf"))
     make(service, asked.json()["id"])
-    told = client.get(address(result, "pdf")).json()
-    assert (told["state"], told["error"]["code"]) == ("failed", "not_found")
-    assert str(service.settings.scratch) not in json.dumps(told)
+    described = client.get(address(result, "pdf")).json()
+    assert (described["state"], described["error"]["code"]) == ("failed", "not_found")
+    assert str(service.settings.scratch) not in json.dumps(described)
 
 
 def test_the_api_draws_nothing() -> None:
     code = "import sys, specimap_service.app\nprint([m for m in ('matplotlib', 'reportlab') if m in sys.modules])"
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
-    assert told.stdout.strip() == "[]"
+    described = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
+    assert described.stdout.strip() == "[]"
 
 
 @pytest.mark.parametrize("kept", [True, False])

@@ -61,22 +61,22 @@ def test_photo_in_three_pieces_is_judged_at_the_last(service: Running) -> None:
     assert result(client, at)["state"] == "open"
     answer = patch(client, at, PHOTO[2 * third :], 2 * third)
     assert (answer.status_code, answer.headers["Specimap-Verdict"]) == (204, "accepted")
-    told = result(client, at)
-    assert (told["state"], told["error"]) == ("finished", None)
-    assert told["file"]["id"] == answer.headers["Specimap-File"]
-    assert told["file"]["sha256"] == hashlib.sha256(PHOTO).hexdigest()
-    assert (told["file"]["label"], told["file"]["name"]) == ("photo-0001.jpg", "IMG 1.jpg")
+    described = result(client, at)
+    assert (described["state"], described["error"]) == ("finished", None)
+    assert described["file"]["id"] == answer.headers["Specimap-File"]
+    assert described["file"]["sha256"] == hashlib.sha256(PHOTO).hexdigest()
+    assert (described["file"]["label"], described["file"]["name"]) == ("photo-0001.jpg", "IMG 1.jpg")
     head = client.head(at, headers=TUS)
     assert head.headers["Upload-Offset"] == head.headers["Upload-Length"] == str(len(PHOTO))
     assert head.headers["Upload-Metadata"] == metadata(acquisition=acquisition, role="photo", filename="IMG 1.jpg")
     # The answer to the last piece got lost: sending nothing once more tells the same.
     again = patch(client, at, b"", len(PHOTO))
-    assert (again.status_code, again.headers["Specimap-File"]) == (204, told["file"]["id"])
+    assert (again.status_code, again.headers["Specimap-File"]) == (204, described["file"]["id"])
     assert client.get(f"/v1/acquisitions/{acquisition}").json()["files"]["photos"] == 1
-    stored = client.get(f"/v1/acquisitions/{acquisition}/files/{told['file']['id']}/content")
+    stored = client.get(f"/v1/acquisitions/{acquisition}/files/{described['file']['id']}/content")
     assert stored.content == PHOTO
     assert list((service.settings.scratch / "uploads").iterdir()) == []
-    audited = client.get("/v1/audit", params={"target": told["file"]["id"]}).json()["items"]
+    audited = client.get("/v1/audit", params={"target": described["file"]["id"]}).json()["items"]
     assert [entry["action"] for entry in audited] == ["file.create"]
 
 
@@ -275,9 +275,9 @@ def test_second_cube_is_refused_before_and_after_it_is_sent(service: Running) ->
     assert patch(client, first, header, 0).headers["Specimap-Verdict"] == "accepted"
     late = patch(client, second, header, 0)
     assert (late.status_code, late.headers["Specimap-Verdict"]) == (204, "refused")
-    told = result(client, second)
-    assert (told["state"], told["file"], told["error"]["code"]) == ("failed", None, "state_conflict")
-    assert "Delete cube.hdr" in told["error"]["advice"]
+    described = result(client, second)
+    assert (described["state"], described["file"], described["error"]["code"]) == ("failed", None, "state_conflict")
+    assert "Delete cube.hdr" in described["error"]["advice"]
     data = (SAMPLES / "hsi" / "hsi.raw").read_bytes()
     at = created(client, acquisition, "cube", len(data), "hsi.raw")
     assert patch(client, at, data, 0).headers["Specimap-Verdict"] == "accepted"

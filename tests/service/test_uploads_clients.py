@@ -32,9 +32,9 @@ def test_tuspy_sends_a_photo_and_a_cube(service: Running, slash: str, checksum: 
         with open(path, "rb") as stream:
             uploader = tus.uploader(file_stream=stream, chunk_size=1_000_000, metadata=fields, upload_checksum=checksum)
             uploader.upload()
-        told = result(client, str(uploader.url).removeprefix(service.url))
-        assert told["file"]["judgement"]["verdict"] == "accepted"
-        assert told["file"]["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+        described = result(client, str(uploader.url).removeprefix(service.url))
+        assert described["file"]["judgement"]["verdict"] == "accepted"
+        assert described["file"]["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
     counts = client.get(f"/v1/acquisitions/{acquisition}").json()["files"]
     assert (counts["photos"], counts["cube"]) == (1, True)
 
@@ -74,8 +74,8 @@ def test_tus_js_client_goes_on_where_the_network_broke(
     finally:
         proxy.close()
     assert done.returncode == 0, done.stdout + done.stderr
-    said = json.loads(done.stdout)
-    assert said["answers"][-1] == ["PATCH", 204, "accepted"]
-    assert ["HEAD", 200, None] in said["answers"]
+    output = json.loads(done.stdout)
+    assert output["answers"][-1] == ["PATCH", 204, "accepted"]
+    assert ["HEAD", 200, None] in output["answers"]
     assert proxy.cut == 3
-    assert result(client, said["url"].removeprefix(proxy.url))["file"]["sha256"] == hashlib.sha256(data).hexdigest()
+    assert result(client, output["url"].removeprefix(proxy.url))["file"]["sha256"] == hashlib.sha256(data).hexdigest()

@@ -101,13 +101,13 @@ def test_a_process_killed_in_the_middle_of_a_chunk(tmp_path: Path) -> None:
     with process_serving(tmp_path) as (process, url), client_at(url, key) as client:
         at = created(client, new_acquisition(client), "cube", len(data), "x.raw")
         connection = half_sent(url, at, key, data, 13_000_000)
-        told = until(client, at, 8_000_000)
+        described = until(client, at, 8_000_000)
         process.kill()
         process.wait()
         connection.close()
     with process_serving(tmp_path) as (process, url), client_at(url, key) as client:
         offset = offset_of(client, at)
-        assert told <= offset <= 13_000_000
+        assert described <= offset <= 13_000_000
         assert patch(client, at, data[offset:], offset).headers["Specimap-Verdict"] == "accepted"
         assert result(client, at)["file"]["sha256"] == hashlib.sha256(data).hexdigest()
 
@@ -129,10 +129,10 @@ def test_a_process_that_died_after_the_last_byte(service: Running, ask: str) -> 
         with service.database.session() as session:
             session.get_one(Upload, upload_id).expires_at = utc_now()
         service.app.state.uploads.sweep()
-    told = result(client, at)
-    assert (told["state"], told["file"]["sha256"]) == ("finished", hashlib.sha256(PHOTO).hexdigest())
+    described = result(client, at)
+    assert (described["state"], described["file"]["sha256"]) == ("finished", hashlib.sha256(PHOTO).hexdigest())
     (file,) = client.get(f"/v1/acquisitions/{acquisition}/files").json()
-    assert file["id"] == told["file"]["id"]
+    assert file["id"] == described["file"]["id"]
     assert len(list(service.storage.list(f"acquisitions/{acquisition}"))) == 1
     assert list((service.settings.scratch / "uploads").iterdir()) == []
 

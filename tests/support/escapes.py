@@ -136,7 +136,7 @@ def _ran(*command: str) -> None:
 def ways(told: dict[str, Any]) -> dict[str, Callable[[], object]]:
     """``told``: secret, elsewhere (a folder), database, parent (process id), tcp and udp (ports), unix (a socket's
     path), abstract (its name), datagrams (another's path), queue (number of a System V message queue), own (a folder to
-    write), link (a symbolic link to the secret that the reader was given), with a file ``plain`` beside it.
+    write), link (a symbolic link to the secret that the reader was given), with a file ``plain`` next to it.
     """
     secret, elsewhere, parent = told["secret"], Path(told["elsewhere"]), told["parent"]
     own, plain = Path(told["own"]), Path(told["link"]).with_name("plain")

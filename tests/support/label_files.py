@@ -31,8 +31,8 @@ def npy(values: NDArray[Any]) -> bytes:
 
 
 def header(kind: str = "class", classes: list[dict[str, Any]] | None = None, **more: Any) -> dict[str, str]:
-    told = {"kind": kind, "classes": CLASSES if classes is None else classes, "made_by": MODEL, **more}
-    return {"X-Specimap-Label": json.dumps(told), "Content-Type": NPY}
+    described = {"kind": kind, "classes": CLASSES if classes is None else classes, "made_by": MODEL, **more}
+    return {"X-Specimap-Label": json.dumps(described), "Content-Type": NPY}
 
 
 def layer(result: Result, name: str = "tissue") -> str:

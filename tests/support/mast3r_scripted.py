@@ -14,7 +14,7 @@ import numpy as np
 
 
 def run(request: dict[str, Any], arrays: dict[str, Any], step: Any) -> Any:
-    """The stored arrays; what was asked is left beside them."""
+    """The stored arrays; the request is left next to them."""
     path = os.environ["ANSWER"]
     with open(path + ".request.json", "w", encoding="utf-8") as file:
         json.dump(request, file)

@@ -25,7 +25,7 @@ SECRET = np.random.default_rng(99).uniform(400, 900, 400)
 
 @pytest.fixture
 def secret(tmp_path: Path) -> Path:
-    """A folder beside the cube's with a file that no cube may show, as raw numbers, as HDF5 and as TIFF."""
+    """A folder next to the cube's with a file that no cube may show, as raw numbers, as HDF5 and as TIFF."""
     folder = tmp_path / "secret"
     folder.mkdir()
     (folder / "raw").write_bytes(SECRET.tobytes())

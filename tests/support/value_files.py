@@ -22,19 +22,19 @@ def listed(numbers: Floats) -> str:
 
 
 def envi(folder: Path, stored: Values, no_data: float | None, gains: Floats | None, offsets: Floats | None) -> Path:
-    said: dict[str, Any] = {"wavelength": listed(NM), "wavelength_units": "nm"}
+    output: dict[str, Any] = {"wavelength": listed(NM), "wavelength_units": "nm"}
     if no_data is not None:
-        said["data_ignore_value"] = f"{no_data:g}"
+        output["data_ignore_value"] = f"{no_data:g}"
     if gains is not None:
-        said["data_gain_values"] = listed(gains)
+        output["data_gain_values"] = listed(gains)
     if offsets is not None:
-        said["data_offset_values"] = listed(offsets)
-    return write_envi(folder / "x.hdr", stored, "bil", **said)
+        output["data_offset_values"] = listed(offsets)
+    return write_envi(folder / "x.hdr", stored, "bil", **output)
 
 
 def _attributes(no_data: float | None, gains: Floats | None, offsets: Floats | None) -> dict[str, object]:
-    said = {"_FillValue": no_data, "scale_factor": gains, "add_offset": offsets}
-    return {name: value for name, value in said.items() if value is not None}
+    output = {"_FillValue": no_data, "scale_factor": gains, "add_offset": offsets}
+    return {name: value for name, value in output.items() if value is not None}
 
 
 def hdf5(folder: Path, stored: Values, no_data: float | None, gains: Floats | None, offsets: Floats | None) -> Path:
@@ -48,9 +48,9 @@ def netcdf4(folder: Path, stored: Values, no_data: float | None, gains: Floats |
     with h5py.File(folder / "x.nc", "w") as f:
         f.create_dataset("cube", data=stored, chunks=(4, *stored.shape[1:]), compression="gzip")
         f["wavelength"] = NM
-        said = _attributes(no_data, gains, offsets)
-        said |= {"missing_value": np.array([said.pop("_FillValue")], stored.dtype)} if no_data is not None else {}
-        f["cube"].attrs.update(said)
+        output = _attributes(no_data, gains, offsets)
+        output |= {"missing_value": np.array([output.pop("_FillValue")], stored.dtype)} if no_data is not None else {}
+        f["cube"].attrs.update(output)
     return folder / "x.nc"
 
 
@@ -67,8 +67,8 @@ def netcdf3(folder: Path, stored: Values, no_data: float | None, gains: Floats |
 
 
 def _beside(no_data: float | None, gains: Floats | None, offsets: Floats | None) -> dict[str, object]:
-    said = {"no_data": no_data, "scale_factor": gains, "add_offset": offsets, "wavelengths": NM}
-    return {name: value for name, value in said.items() if value is not None}
+    output = {"no_data": no_data, "scale_factor": gains, "add_offset": offsets, "wavelengths": NM}
+    return {name: value for name, value in output.items() if value is not None}
 
 
 def matlab5(folder: Path, stored: Values, no_data: float | None, gains: Floats | None, offsets: Floats | None) -> Path:

@@ -95,7 +95,7 @@ def test_a_bare_photo_shows_the_same_scene_without_cards(still: Phantom) -> None
     around = cv2.dilate(on_card, np.ones((5, 5), np.uint8)) > 0
     assert not changed[~around].any()
     assert changed[on_card > 0].mean() > 0.8
-    # Where cards lay, the picture is as bright and as even as the tray beside them.
+    # Where cards lay, the picture is as bright and as even as the tray next to them.
     beside = (cv2.dilate(on_card, np.ones((9, 9), np.uint8)) > 0) & ~around
     assert abs(np.median(without[on_card > 0]) - np.median(without[beside])) < 10
     assert without[on_card > 0].std() < 1.5 * without[beside].std() < 0.7 * with_cards[on_card > 0].std()

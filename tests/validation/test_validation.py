@@ -1,4 +1,4 @@
-"""``specimap validate``: cases, variants that share their stages, tables with the true error beside the published."""
+"""``specimap validate``: cases, variants that share their stages, tables with the true error next to the published."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ class Artefacts:
                         seconds=seconds,
                     )
                 )
-                # Starts count from the last finished stage: whoever gets on is not poisoned.
+                # Starts count from the last finished stage: a job that gets on is not poisoned.
                 job.starts = 1
                 job.seconds = {**job.seconds, stage: round(seconds, 3)}
         except BaseException:

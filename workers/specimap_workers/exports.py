@@ -48,7 +48,7 @@ def run_export(
     times. What goes wrong is in the row, which is then ``failed``.
 
     Raises:
-        CancelledError: ``cancelled`` came true; the row stays as it is, for whoever takes it up.
+        CancelledError: ``cancelled`` came true; the row stays as it is, for the worker that takes it up.
         DatabaseUnavailableError: the row could not be read or written.
     """
     export = _claim(database, export_id, executor)

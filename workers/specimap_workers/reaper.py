@@ -34,7 +34,7 @@ class Reaper:
         self._settle()
 
     def hand_over(self, executor: str) -> None:
-        """Put what an executor held back in the queue; only its own, and only once, whoever else does the same."""
+        """Put what an executor held back in the queue; only its own, and only once, even where others do the same."""
         pending = self._client.list_workflows(
             status="PENDING", executor_id=executor, load_input=False, load_output=False
         )

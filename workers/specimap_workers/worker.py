@@ -140,7 +140,7 @@ class Worker:
         DBOS(config=config)
 
     def _register(self) -> None:
-        """Declare the workflows. Their first act is not a step: whoever takes a job over must claim it anew."""
+        """Declare the workflows. Their first act is not a step: the worker that takes a job over must claim it anew."""
 
         @DBOS.step(name="stage", preemptible=True)
         async def stage_step(job_id: str, stage: str) -> dict[str, Any]:

@@ -25,7 +25,7 @@ Kind = Literal["class", "probability"]
 CHUNK_LABELS = 4096
 LARGEST_CLASS = 65535
 GROUP_DOCUMENT = json_text({"zarr_format": 3, "node_type": "group", "attributes": {}}, indent=1).encode()
-"""``labels/zarr.json`` beside the layers, so that readers find the group that holds them."""
+"""``labels/zarr.json`` next to the layers, so that readers find the group that holds them."""
 
 
 def checked_labels(

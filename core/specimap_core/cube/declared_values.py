@@ -26,7 +26,7 @@ _CF_SCALE = "scale_factor"
 _GAINS = ("scalefactor", "datagainvalues")
 _OFFSETS = ("addoffset", "dataoffsetvalues")
 _DIVISOR = "reflectancescalefactor"
-# ENVI's words for what makes reflectance; the plain ones beside them make radiance.
+# ENVI's words for what makes reflectance; the plain ones next to them make radiance.
 _REFLECTANCE_GAINS = ("datareflectancegainvalues",)
 _REFLECTANCE_OFFSETS = ("datareflectanceoffsetvalues",)
 _CEILING = ("ceiling", "saturationlevel", "saturationvalue")
@@ -98,7 +98,7 @@ def plain(name: str) -> str:
 def declared_of(
     file_name: str, attributes: Mapping[str, object], *titles: str | None, description: str | None = None
 ) -> Declared:
-    """What the attributes of a data set, the fields of a header, or small variables beside an array declare.
+    """What the attributes of a data set, the fields of a header, or small variables next to an array declare.
 
     ``scale_factor`` and ``add_offset`` are CF's: stored * scale_factor + add_offset. Spelt otherwise
     (``Scale_Factor``, as NEON does), or of a data set that calls itself reflectance, a factor of more than 1 is
@@ -161,7 +161,7 @@ def _other_quantity(titles: Sequence[str | None], description: str | None) -> st
 
 
 def is_word(name: str, shape: tuple[int, ...]) -> bool:
-    """Whether a small variable beside an array, by its name and shape, declares something of the array's values."""
+    """Whether a small variable next to an array, by its name and shape, declares something of the array's values."""
     size = math.prod(shape)
     return plain(name) in WORDS and size == max(shape, default=1) and 0 < size <= _LONGEST
 

@@ -154,7 +154,7 @@ def _refusal(path: Path, what: str, variables: Sequence[Variable]) -> CubeFormat
 def choose_wavelengths(variables: Sequence[Variable], cube: Variable) -> Variable | None:
     """The vector whose name speaks of wavelengths; one as long as an axis of the cube, and near it, comes first.
 
-    Its units are those that it states, else those of a text beside it, else those at the end of its name.
+    Its units are those that it states, else those of a text next to it, else those at the end of its name.
     """
     vectors = _spectral_vectors(variables)
     if not vectors:

@@ -1,4 +1,4 @@
-"""ENVI cubes: a text header and a plain binary file beside it."""
+"""ENVI cubes: a text header and a plain binary file next to it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from specimap_core.notices import Notice, Notices
 
 _HEADER_SUFFIX = ".hdr"
 _DATA_SUFFIXES = ("", ".raw", ".img", ".dat", ".bil", ".bip", ".bsq", ".bin", ".hyspex", ".cube", ".hsi", ".envi")
-# What instruments and programs put beside a cube under its name; none of it is taken for the data.
+# What instruments and programs put next to a cube under its name; none of it is taken for the data.
 _OTHER_SUFFIXES = {
     ".hdr",
     ".txt",

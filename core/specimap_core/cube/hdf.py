@@ -178,7 +178,7 @@ def _text(value: object) -> str | None:
 
 
 def _declared(path: Path, file: h5py.File, dataset: h5py.Dataset) -> Declared:
-    """What the cube's own attributes declare of its values, and small data sets beside it (MATLAB keeps them so)."""
+    """What the cube's own attributes declare of its values, and small data sets next to it (MATLAB keeps them so)."""
     stated: dict[str, object] = {}
     group = dataset.parent
     for name in filter(str.isascii, map(as_text, group)):

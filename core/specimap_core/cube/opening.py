@@ -73,7 +73,7 @@ def _open(given: Path) -> tuple[Cube, str | None]:
                 return cube_format.open(path, dataset), dataset
     except SpecimapError:
         raise
-    except PermissionError as error:  # from the file's own folder, or from the data beside a header
+    except PermissionError as error:  # from the file's own folder, or from the data next to a header
         raise _not_readable(Path(error.filename) if isinstance(error.filename, str) else path) from error
     except Exception as error:
         # Not a list of types: on damaged files the libraries raise anything, ZeroDivisionError included.

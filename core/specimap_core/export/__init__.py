@@ -38,10 +38,10 @@ def export_cloud(cloud: Cloud, target: Path, format: ExportFormat, *, grid_mm: f
 
     Spectra are in ``npz``, ``csv`` and, resampled on a top view of ``grid_mm``, ``envi``; ``ply`` and ``las``
     hold the geometry, in the cloud's order, so that the n-th point's spectrum is the cloud's n-th. ``html`` and
-    ``pdf`` are the accuracy report, drawn from the files beside the cloud.
+    ``pdf`` are the accuracy report, drawn from the files next to the cloud.
 
     Raises SettingsError for an unknown format or a grid that is not positive or far too fine,
-    BackendUnavailableError where a format's library is not installed, NotFoundError where no report lies beside
+    BackendUnavailableError where a format's library is not installed, NotFoundError where no report lies next to
     the cloud, StorageFullError, OutputNotWritableError, CloudDamagedError.
     """
     exporter = EXPORTERS.get(format)

@@ -32,7 +32,7 @@ def write_zarr_zip(cloud: Cloud, target: Path) -> Path:
 def write_envi_zip(cloud: Cloud, target: Path, *, grid_mm: float = 0.5) -> Path:
     """Write ``cloud.hdr`` and ``cloud.bil`` as :func:`write_envi` makes them, deflated.
 
-    The pair stands beside ``target`` meanwhile. Raises SettingsError for the grid, StorageFullError,
+    The pair stands next to ``target`` meanwhile. Raises SettingsError for the grid, StorageFullError,
     OutputNotWritableError, CloudDamagedError.
     """
     with disk_errors(target), TemporaryDirectory(prefix=".", suffix=".tmp", dir=target.parent) as folder:

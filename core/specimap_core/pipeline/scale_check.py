@@ -45,7 +45,7 @@ def check_scale(
     _check_edge(reach_mm(poses, corners), settings.adjust.edge_mm, subject_mm)
     width, height = np.ptp(corners.reshape(-1, 3), axis=0)[:2]
     for name, cell in (("r_pc", settings.render.r_pc_mm), ("r_reg", settings.render.r_reg_mm)):
-        # A single marker spans nothing; what is wrong then is told where the cube's markers are counted.
+        # A single marker spans nothing; the fault is reported then where the cube's markers are counted.
         coarse = len(corners) > 1 and max(width, height) < LEAST_CELLS * cell
         if coarse or width * height > LARGEST_GRID_CELLS * cell**2:
             finest = max(OPTIONS[name].bounds[0], float(np.sqrt(width * height / LARGEST_GRID_CELLS)))

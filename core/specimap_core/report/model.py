@@ -121,7 +121,7 @@ class CubeCorners(Section):
 
 
 class Report(Section):
-    """Everything that is said about a result. Lengths in mm, angles in degrees, times in seconds."""
+    """All figures and warnings of a result. Lengths in mm, angles in degrees, times in seconds."""
 
     specimap_version: str
     created: str

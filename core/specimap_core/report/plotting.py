@@ -122,7 +122,7 @@ def colour_map(name: str) -> Colormap:
 
 
 def colour_bar(figure: Figure, ax: Axes | Sequence[Axes], mapped: Any, label: str, *, extend: str = "neither") -> None:
-    """A colour bar beside ``ax`` for what ``imshow`` or ``scatter`` returned; ``label`` carries the unit."""
+    """A colour bar next to ``ax`` for what ``imshow`` or ``scatter`` returned; ``label`` carries the unit."""
     bar = figure.colorbar(mapped, ax=ax, shrink=0.85, pad=0.02, aspect=28, extend=extend)
     bar.set_label(label, fontsize=FONT_PT, color=INK)
     bar.ax.tick_params(labelsize=SMALL_PT, colors=MUTED, length=3, width=0.6)

@@ -101,7 +101,7 @@ def save_truth(truth: Truth, path: Path) -> None:
 def load_truth(path: Path) -> Truth:
     """Read a phantom's ``truth.npz``, or that of the folder ``path``.
 
-    Raises ``NotFoundError`` if the file is not there or is none, or says no photo size and has no photo beside it.
+    Raises ``NotFoundError`` if the file is not there or is none, or says no photo size and has no photo next to it.
     """
     file = path / "truth.npz" if path.is_dir() else path
     if not file.is_file():

@@ -75,12 +75,12 @@ def test_true_depth_in_any_unit_makes_a_true_cloud(
     assert 0.05 < found.p95 < 1.0
     assert found.coverage > 0.97
     assert 1e-7 < abs(found.scale) < 0.003
-    said = {w.code: w.message for w in report.warnings}
-    assert "1 of 12" in said["depth_unaligned"]
-    assert "view_003" in said["depth_unaligned"]
-    assert "Apache" in said["licence_apache"]
-    assert "not pinned" in said["backend_run"]
-    assert sha256_of(weights) in said["backend_run"]
+    output = {w.code: w.message for w in report.warnings}
+    assert "1 of 12" in output["depth_unaligned"]
+    assert "view_003" in output["depth_unaligned"]
+    assert "Apache" in output["licence_apache"]
+    assert "not pinned" in output["backend_run"]
+    assert sha256_of(weights) in output["backend_run"]
     shares = [share for stage, share in heard if stage == "reconstruct"]
     assert shares == sorted(shares)
     assert len(report.photos.used) == 12

@@ -222,10 +222,10 @@ def test_the_image_lies_where_the_map_says_to_a_hundredth_of_a_pixel(photo: tupl
     shown = plan.apply(ramp).astype(float)
     assert shown.shape == (plan.size[1], plan.size[0], 3)
     u, v = np.meshgrid(np.arange(plan.size[0]), np.arange(plan.size[1]))
-    said = plan.to_photo(np.stack([u, v], -1).astype(float))
+    output = plan.to_photo(np.stack([u, v], -1).astype(float))
     inner = np.s_[8:-8, 8:-8]
     for axis in (0, 1):
-        off = (shown[..., axis] - 8 - said[..., axis])[inner]
+        off = (shown[..., axis] - 8 - output[..., axis])[inner]
         assert abs(off.mean()) * plan.scale < 0.01
         assert 1e-6 < np.abs(off).max() <= 1.1
 

@@ -218,8 +218,8 @@ def test_what_is_not_a_number_is_refused_or_dropped() -> None:
 
 
 def test_upstreams_bars_become_steps_in_their_order() -> None:
-    told: list[tuple[str, float]] = []
-    bar = bars(lambda name, share: told.append((name, share)))
+    described: list[tuple[str, float]] = []
+    bar = bars(lambda name, share: described.append((name, share)))
     for _ in bar([1, 2]):
         pass
     for _ in bar([1]):
@@ -228,7 +228,7 @@ def test_upstreams_bars_become_steps_in_their_order() -> None:
         with bar(total=4) as inner:
             inner.set_postfix_str("x")
             inner.update(1)
-    assert told == [
+    assert described == [
         ("pairs", 0.5),
         ("pairs", 1.0),
         ("views", 1.0),

@@ -149,9 +149,9 @@ def test_answers_say_null_or_nan(reader: httpx.Client, result: Result) -> None:
     right = of_points(cloud, values())
     lacking = np.flatnonzero(np.isnan(right[:, 2]) & ~np.isnan(right[:, 1]))[:3].tolist()
     asked = {"select": {"indices": lacking}}
-    told = reader.post("spectra", json=asked).json()["spectra"]
-    assert [row[2] for row in told] == [None] * 3
-    np.testing.assert_allclose(np.array(told, float), right[lacking], rtol=0, atol=0.51e-4)
+    described = reader.post("spectra", json=asked).json()["spectra"]
+    assert [row[2] for row in described] == [None] * 3
+    np.testing.assert_allclose(np.array(described, float), right[lacking], rtol=0, atol=0.51e-4)
     npy = np.load(io.BytesIO(reader.post("spectra", json=asked, headers={"Accept": NPY}).content))
     np.testing.assert_allclose(npy, right[lacking], rtol=0, atol=0.51e-4)
     with pa.ipc.open_stream(reader.post("spectra", json=asked, headers={"Accept": ARROW}).content) as stream:

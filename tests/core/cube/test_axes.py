@@ -24,8 +24,8 @@ def test_bands_by_the_wavelengths_length(tmp_path: Path, write: Writer, axes: tu
 
 
 def test_tiff_whose_pages_are_rows(tmp_path: Path) -> None:
-    told = {"wavelengths": NM.tolist()}
-    tifffile.imwrite(tmp_path / "x.tif", COUNTS, photometric="minisblack", metadata=told)
+    described = {"wavelengths": NM.tolist()}
+    tifffile.imwrite(tmp_path / "x.tif", COUNTS, photometric="minisblack", metadata=described)
     cube = open_cube(tmp_path / "x.tif")
     check_reads(cube, COUNTS)
     np.testing.assert_allclose(cube.wavelengths_nm, NM)

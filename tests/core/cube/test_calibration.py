@@ -122,6 +122,6 @@ def test_an_exposure_that_differs_is_said(tmp_path: Path, of_white: str, of_raw:
     raw = write_envi(tmp_path / "raw.hdr", values, tint=of_raw)
     dark = write_envi(tmp_path / "dark.hdr", np.full_like(values, 90), tint=of_raw)
     cube = open_cube(raw, white=write_envi(tmp_path / "w.hdr", values[:1] + 50, tint=of_white), dark=dark)
-    told = messages(cube.warnings).get("reference_exposure_differs", "")
-    assert bool(told) == said
-    assert not said or "white reference was exposed 0.2 times as long" in told
+    described = messages(cube.warnings).get("reference_exposure_differs", "")
+    assert bool(described) == said
+    assert not said or "white reference was exposed 0.2 times as long" in described

@@ -130,6 +130,6 @@ def test_the_judgement_of_a_cube_lists_what_was_found(tmp_path: Path) -> None:
     stored[:9] = -9999
     path = write_envi(tmp_path / "x.hdr", stored, data_ignore_value=-9999, reflectance_scale_factor=10000)
     verdict = judge_cube(path)
-    said = {warning["code"] for warning in verdict.facts["warnings"]}
-    assert {"pixels_nan", "reflectance_factor_unused"} <= said
+    output = {warning["code"] for warning in verdict.facts["warnings"]}
+    assert {"pixels_nan", "reflectance_factor_unused"} <= output
     assert verdict.facts["quantity"] == "reflectance"

@@ -95,8 +95,8 @@ def test_radiance_with_a_white_of_radiance_is_reflectance(tmp_path: Path) -> Non
 
 
 def test_percent_that_is_called_reflectance_is_said_in_envi(tmp_path: Path) -> None:
-    said: dict[str, Any] = {"z_plot_titles": "{Wavelength, Reflectance (%)}"}
-    cube = open_cube(write_envi(tmp_path / "x.hdr", scene() * 100, **said))
+    output: dict[str, Any] = {"z_plot_titles": "{Wavelength, Reflectance (%)}"}
+    cube = open_cube(write_envi(tmp_path / "x.hdr", scene() * 100, **output))
     assert cube.quantity == "counts"
     assert "reflectance_implausible" in codes(cube)
 

@@ -88,9 +88,9 @@ def _netcdf3(folder: Path, values: Any, wavelengths: Any, unit: str) -> Path:
 
 
 def _tiff(folder: Path, values: Any, wavelengths: Any, unit: str) -> Path:
-    told = {"wavelengths": list(map(float, wavelengths)), "wavelength_units": unit}
+    described = {"wavelengths": list(map(float, wavelengths)), "wavelength_units": unit}
     pages = np.ascontiguousarray(values.transpose(2, 0, 1))
-    tifffile.imwrite(folder / "x.tif", pages, photometric="minisblack", metadata=told)
+    tifffile.imwrite(folder / "x.tif", pages, photometric="minisblack", metadata=described)
     return folder / "x.tif"
 
 

@@ -64,7 +64,7 @@ def test_the_stated_sigma_is_of_the_errors_size() -> None:
 
 
 def test_squares_of_all_sizes_are_measured_together_as_alone() -> None:
-    """Profiles of different lengths stand beside each other; what pads the short ones must not count."""
+    """Profiles of different lengths stand next to each other; what pads the short ones must not count."""
     places = {0: square(40.3, 50.7, 17.2, 12), 1: square(120.6, 60.1, 38.5, -33), 2: square(270.2, 170.4, 150.9, 61)}
     light = linear_from_srgb(picture(places, noise=0.5))
     truth = np.stack(list(places.values()))

@@ -193,7 +193,7 @@ def test_a_transposed_photo_without_exif_is_turned_too(tmp_path: Path) -> None:
 
 
 def test_real_photos_share_one_frame(data_dir: Path) -> None:
-    """Stored with EXIF orientation 6: pixels are upright, whoever reads them."""
+    """Stored with EXIF orientation 6: pixels are upright, whatever reads them."""
     paths = photo_paths(data_dir / "real_exif_rotated" / "images")
     photos, refused = read_photos(paths, AcquisitionSettings(working_px=1280, least_photos=3))
     assert not refused

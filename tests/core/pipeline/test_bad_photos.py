@@ -55,8 +55,8 @@ def test_names_that_are_no_utf8_are_shown_as_far_as_they_are(small: OnDisk, tmp_
     assert "sch\ufffdn.jpg" in {p.name for p in read}
     assert len(read) == len(list(small.photos.iterdir()))
     assert [(r.name, r.code) for r in refused] == [("n\ufffdchste.jpg", "photo_unreadable")]
-    said = json_text([*(w.message for w in photo_folder(photos).warnings()), refused[0].reason], ensure_ascii=False)
-    assert said.encode("utf-8").decode().count("\ufffd") == 3
+    output = json_text([*(w.message for w in photo_folder(photos).warnings()), refused[0].reason], ensure_ascii=False)
+    assert output.encode("utf-8").decode().count("\ufffd") == 3
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""Photos as large as phones take them, close up: the whole run against truth, beside the same photos as they were."""
+"""Close-up photos as large as phones take them: the whole run against truth, compared with the same photos scaled."""
 
 from __future__ import annotations
 

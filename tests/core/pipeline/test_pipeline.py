@@ -61,11 +61,11 @@ def test_spectra_and_flags_are_those_of_their_pixels(finished: Finished, small: 
     pixels = cloud.hsi_pixel[chosen]
     assert np.array_equal(cloud.stored_spectra(chosen), values[pixels[:, 0], pixels[:, 1]])
     true = small.truth.hsi_class[cloud.hsi_pixel[:, 0], cloud.hsi_pixel[:, 1]] == 1
-    said = (cloud.flags & Flag.SPECIMEN) > 0
-    assert (true & said).sum() / (true | said).sum() > 0.8
+    output = (cloud.flags & Flag.SPECIMEN) > 0
+    assert (true & output).sum() / (true | output).sum() > 0.8
     card = small.truth.hsi_class[cloud.hsi_pixel[:, 0], cloud.hsi_pixel[:, 1]] == 2
-    said = (cloud.flags & Flag.MARKER_CARD) > 0
-    assert (card & said).sum() / (card | said).sum() > 0.8
+    output = (cloud.flags & Flag.MARKER_CARD) > 0
+    assert (card & output).sum() / (card | output).sum() > 0.8
 
 
 @pytest.mark.slow

@@ -63,10 +63,10 @@ def test_the_same_result_however_values_are_stored(
     small: OnDisk, finished: Finished, tmp_path: Path, name: str
 ) -> None:
     plain = small.values()
-    values, said = cubes(plain)[name]
+    values, output = cubes(plain)[name]
     edge = BORDER if len(values) > len(plain) else 0
     wavelengths = listed(small.truth.wavelengths_nm)
-    path = write_envi(tmp_path / "x.hdr", values, "bil", wavelength=wavelengths, wavelength_units="nm", **said)
+    path = write_envi(tmp_path / "x.hdr", values, "bil", wavelength=wavelengths, wavelength_units="nm", **output)
     out = finished.copy_to(tmp_path / "out")
     report: Report = run_pipeline(Inputs(small.photos, path), out, PipelineSettings())
     assert report.marker_ids_in_cube == finished.report.marker_ids_in_cube
@@ -81,7 +81,7 @@ def test_the_same_result_however_values_are_stored(
     spectra, flags = spectra_image(cloud, shape)
     right = plain / 10000 - (0.05 if name == "negative" else 0)
     if name == "gains":
-        gains, offsets = (np.array([float(n) for n in said[key].strip("{}").split(",")]) for key in sorted(said))
+        gains, offsets = (np.array([float(n) for n in output[key].strip("{}").split(",")]) for key in sorted(output))
         right = values * gains + offsets
     missing = np.zeros(plain.shape, bool)
     if name == "dead":

@@ -145,5 +145,5 @@ def test_torch_stays_out_unless_aliked_is_asked_for() -> None:
         "from specimap_core.reconstruct.features import choice; "
         "choice.feature_kind('sift', 1); choice.check_features('auto'); print('torch' in sys.modules)"
     )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
-    assert said.stdout.strip() == "False"
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
+    assert output.stdout.strip() == "False"

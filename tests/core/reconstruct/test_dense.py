@@ -117,12 +117,12 @@ def test_progress_rises_to_one_and_what_it_raises_ends_the_work() -> None:
     assert heard == sorted(heard)
     assert heard[-1] == pytest.approx(1.0)
 
-    told: list[float] = []
+    described: list[float] = []
 
     def stop(share: float) -> None:
-        told.append(share)
+        described.append(share)
         raise CancelledError("Stopped.", advice="Run again.")
 
     with pytest.raises(CancelledError):
         dense_depth(scene.images, scene.lens, scene.poses, scene.volume, few, workers=2, progress=stop)
-    assert len(told) == 1
+    assert len(described) == 1

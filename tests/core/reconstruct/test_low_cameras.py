@@ -82,7 +82,7 @@ def test_depth_under_low_cameras_is_true() -> None:
         truth = true_depth(phantom.scene, view)
         rows, cols = np.nonzero((one.depth > 0) & (truth > 0))
         cam = view.intrinsics.rays(np.stack([cols, rows], -1).astype(float)) * truth[rows, cols, None]
-        # The table's rim is seen at a grazing angle, beside what lies beyond it.
+        # The table's rim is seen at a grazing angle, next to what lies beyond it.
         inner = np.linalg.norm(view.cam_from_world.inverse().apply(cam)[:, :2], axis=1) < 40
         off.append((one.depth - truth)[rows, cols][inner])
     miss = np.abs(np.concatenate(off))
@@ -112,17 +112,17 @@ def refusal(images: list[Bytes], lens: Intrinsics, poses: tuple[Pose, ...], corn
 def test_black_photos_are_said_to_match_nothing() -> None:
     phantom = low()
     bare = [np.zeros((448, 448, 3), np.uint8)] * len(phantom.views)
-    said = refusal(bare, phantom.views[0].intrinsics, poses_of(phantom), phantom.truth.marker_corners)
-    assert "Hardly anything matches" in said.message
-    assert said.details["pairs_with_depth"] == 0
+    output = refusal(bare, phantom.views[0].intrinsics, poses_of(phantom), phantom.truth.marker_corners)
+    assert "Hardly anything matches" in output.message
+    assert output.details["pairs_with_depth"] == 0
 
 
 def test_photos_from_opposite_sides_are_said_to_be_too_far_apart() -> None:
     phantom = low()
     bare = [np.zeros((448, 448, 3), np.uint8)] * 3
     poses = tuple(poses_of(phantom)[k] for k in (0, 8, 16))
-    said = refusal(bare, phantom.views[0].intrinsics, poses, phantom.truth.marker_corners)
-    assert "No two of the 3 photos" in said.message
+    output = refusal(bare, phantom.views[0].intrinsics, poses, phantom.truth.marker_corners)
+    assert "No two of the 3 photos" in output.message
 
 
 def test_few_photos_all_around_are_said_to_lie_too_far_apart() -> None:
@@ -133,9 +133,9 @@ def test_few_photos_all_around_are_said_to_lie_too_far_apart() -> None:
     corners = low().truth.marker_corners
     neighbours = np.sort(viewing_angles_deg(poses, volume_over(corners, poses).centre), axis=1)[:, 1]
     assert 33 < neighbours.min() < neighbours.max() < 42
-    said = refusal([np.zeros((448, 448, 3), np.uint8)] * 7, lens, poses, corners)
-    assert f"{np.median(neighbours):.0f} degrees apart: too far" in said.message
-    assert "10 to 20 degrees" in said.advice
+    output = refusal([np.zeros((448, 448, 3), np.uint8)] * 7, lens, poses, corners)
+    assert f"{np.median(neighbours):.0f} degrees apart: too far" in output.message
+    assert "10 to 20 degrees" in output.advice
 
 
 def test_two_maps_alone_are_no_surface() -> None:
@@ -151,6 +151,6 @@ def test_photos_of_single_markers_are_said_to_show_nothing_in_common() -> None:
         look_at(np.array([20 * np.cos(a), 20 * np.sin(a), 150.0]), np.array([50 * np.cos(a), 50 * np.sin(a), 0.0]), UP)
         for a in angles
     )
-    said = refusal([np.zeros((224, 224, 3), np.uint8)] * 12, lens, poses, low().truth.marker_corners)
-    assert "too little in common" in said.message
-    assert "150 mm above markers that span" in said.message
+    output = refusal([np.zeros((224, 224, 3), np.uint8)] * 12, lens, poses, low().truth.marker_corners)
+    assert "too little in common" in output.message
+    assert "150 mm above markers that span" in output.message

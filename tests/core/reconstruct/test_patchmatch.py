@@ -150,7 +150,7 @@ def test_the_child_asks_for_consistent_depth_in_the_volume_and_tells_how_far_it_
             time.sleep(1.2 * WATCH_SECONDS)
 
     monkeypatch.setattr(pycolmap, "patch_match_stereo", colmap)
-    told: list[tuple[str, float]] = []
+    described: list[tuple[str, float]] = []
     arrays = {
         "images": np.zeros((6, 160, 200, 3), np.uint8),
         "pinhole": np.array([plain.focal_px, plain.cx, plain.cy]),
@@ -162,11 +162,11 @@ def test_the_child_asks_for_consistent_depth_in_the_volume_and_tells_how_far_it_
         "depth_mm": [90.0, 210.0],
         "sources": patchmatch.choose_sources(poses, VOLUME.centre, DepthSettings()),
     }
-    found, facts = run(request, arrays, lambda step, share: told.append((step, share)))
+    found, facts = run(request, arrays, lambda step, share: described.append((step, share)))
     assert found["depth"][:, 3, 5].tolist() == [100, 101, 102, 103, 104, 105]
     assert facts == {"photos": 6}
     assert (asked[0].depth_min, asked[0].depth_max) == (90, 210)
     assert asked[0].geom_consistency
     assert asked[0].filter
-    assert ("depth", 0.5) in told
-    assert [share for _, share in told] == sorted(share for _, share in told)
+    assert ("depth", 0.5) in described
+    assert [share for _, share in described] == sorted(share for _, share in described)

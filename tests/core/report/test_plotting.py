@@ -49,7 +49,7 @@ def test_nothing_needs_a_screen_or_says_anything() -> None:
         "import sys; from specimap_core.report import plotting as p; f = p.figure(); p.styled(f.add_subplot()); "
         "p.png(f); print('matplotlib.pyplot' in sys.modules)"
     )
-    told = subprocess.run(
+    described = subprocess.run(
         [sys.executable, "-W", "error", "-c", code],
         capture_output=True,
         text=True,
@@ -57,7 +57,7 @@ def test_nothing_needs_a_screen_or_says_anything() -> None:
         timeout=120,
         env={"MPLCONFIGDIR": "/proc/nowhere", "HOME": "/proc/nowhere"},
     )
-    assert (told.stdout, told.stderr) == ("False\n", "")
+    assert (described.stdout, described.stderr) == ("False\n", "")
 
 
 @pytest.mark.parametrize(

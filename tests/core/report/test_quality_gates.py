@@ -73,9 +73,9 @@ def test_each_figure_beyond_its_limit_is_said_twice(changes: dict[str, Any], cod
         return
     found = gated(report(**changes), EDGE_MM)
     assert codes(found) == {code}
-    said = verdict(found)
-    assert said.level == "attention"
-    assert said.actions
+    output = verdict(found)
+    assert output.level == "attention"
+    assert output.actions
     assert WARNING_ADVICE[code]
     failed = [c for c in checks(found) if not c.good]
     assert failed or code in GRAVE
@@ -171,9 +171,9 @@ def test_a_card_that_moved_in_one_photo_is_named(small: OnDisk, tmp_path: Path) 
     photos = copied(small.photos, tmp_path / "photos")
     (name,) = card_moved(small, photos, marker=2, by_mm=(2.0, 0.0), photos=slice(0, 1))
     found = ran(photos, small.header, tmp_path / "out")
-    (said,) = [w.message for w in found.warnings if w.code == "photo_outlying"]
-    assert f"{name} " in said
-    assert "marker 2" in said
+    (output,) = [w.message for w in found.warnings if w.code == "photo_outlying"]
+    assert f"{name} " in output
+    assert "marker 2" in output
     assert verdict(found).level == "attention"
     # The adjustment is robust: the result itself holds.
     assert found.corner_2d_mm.mean < 0.1

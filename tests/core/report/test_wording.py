@@ -17,9 +17,9 @@ def test_every_documented_refusal_has_its_advice() -> None:
 
 def test_verdicts() -> None:
     report = full_report(10)
-    said = verdict(report)
-    assert (said.level, said.actions) == ("good", ())
-    assert "All 3 photos were used." in said.sentences
+    output = verdict(report)
+    assert (output.level, output.actions) == ("good", ())
+    assert "All 3 photos were used." in output.sentences
     warned = report.model_copy(update={"warnings": [Notice(code="few_photos", message="Few.")]})
     assert verdict(warned).level == "note"
     assert "with the warnings below" in verdict(warned).title
@@ -33,12 +33,12 @@ def test_verdicts() -> None:
             "coverage": report.coverage.model_copy(update={"between_markers": 0.97}),
         }
     )
-    said = verdict(bad)
-    assert said.level == "attention"
-    assert "4 of 6 checks failed" in said.title
-    assert "3 of 6 photos were not used (3 blurred)." in said.sentences
-    assert "0.jpg, 1.jpg, 2.jpg" in said.actions[0]
-    assert "marker 2, 3 in view" in said.actions[1]
+    output = verdict(bad)
+    assert output.level == "attention"
+    assert "4 of 6 checks failed" in output.title
+    assert "3 of 6 photos were not used (3 blurred)." in output.sentences
+    assert "0.jpg, 1.jpg, 2.jpg" in output.actions[0]
+    assert "marker 2, 3 in view" in output.actions[1]
     board = report.model_copy(update={"marker_ids": list(range(30)), "marker_ids_in_cube": list(range(5))})
     assert all(check.good for check in checks(board))
 

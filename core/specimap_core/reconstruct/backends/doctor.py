@@ -108,7 +108,7 @@ def diagnose(environment: Mapping[str, str]) -> Diagnosis:
     """Look at everything that the environment names; takes as long as importing the slowest library."""
     own, plans = sys.executable, [_mast3r(environment), _da3(environment)]
     asked = _Asked([(own, ALIKED_MODULES), *((p.python, p.modules) for p in plans)])
-    # The default backend's libraries are asked for apart, beside those that take longer.
+    # The default backend's libraries are probed apart from those that take longer.
     colmap = _Asked([(own, COLMAP_MODULES)])
     gpus = driver_gpus()
     backends = [plan.judged(asked) for plan in plans]
