@@ -18,6 +18,7 @@ pytest_plugins = (
     "tests.support.service_scene",
     "tests.support.client_scene",
     "tests.support.da3_scene",
+    "tests.support.feature_scene",
     "tests.support.secret_file",
 )
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from specimap_core.arrays import Floats
 from specimap_core.geometry.cameras import Pose, View, fit_similarity, skew
 from specimap_core.photos.reading import Photo, sharpness_of
 from specimap_core.reconstruct.backend import CornersInPhotos, corners_in_photos, detect_in_photos
+from specimap_core.reconstruct.features import sift
+from specimap_core.reconstruct.features.base import Features, Pairs
 from specimap_validation.phantom import PhantomSettings
 from specimap_validation.phantom.phantom import Phantom
 
@@ -74,3 +78,27 @@ def epipolar_px(views: tuple[View, View], xy: tuple[Floats, Floats]) -> Floats:
     first, second = (np.concatenate([x, np.ones((len(x), 1))], 1) for x in xy)
     lines = first @ fundamental.T
     return np.asarray(np.abs((second * lines).sum(1)) / np.linalg.norm(lines[:, :2], axis=1))
+
+
+@pytest.fixture(scope="module")
+def remembered_sift() -> Iterator[None]:
+    """SIFT looks at each photo, and at each pair of them, once in a module: most of a test's time goes there."""
+    extract, match = sift.extract, sift.match
+    of_photos: dict[int, tuple[Photo, Features]] = {}
+    of_pairs: dict[tuple[int, int], tuple[Features, Features, Pairs]] = {}
+
+    def extract_once(photo: Photo) -> Features:
+        if id(photo) not in of_photos:
+            of_photos[id(photo)] = photo, extract(photo)
+        return of_photos[id(photo)][1]
+
+    def match_once(a: Features, b: Features) -> Pairs:
+        key = id(a), id(b)
+        if key not in of_pairs:
+            of_pairs[key] = a, b, match(a, b)
+        return of_pairs[key][2].copy()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sift, "extract", extract_once)
+        patch.setattr(sift, "match", match_once)
+        yield

@@ -66,29 +66,23 @@ def test_output_folders_that_cannot_be_used(small: OnDisk, tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("number", "code"), [(errno.ENOSPC, "storage_full"), (errno.EACCES, "output_not_writable")])
 @pytest.mark.parametrize("step", ["write_mesh_ply", "write_cloud", "write_preview"])
 def test_a_disk_that_refuses_leaves_the_earlier_results(
-    small: OnDisk,
-    finished: Finished,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    number: int,
-    code: str,
-    step: str,
+    small: OnDisk, finished: Finished, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
 ) -> None:
     from specimap_core.pipeline import register_stage
 
     out = finished.copy_to(tmp_path / "out")
     before = tree_of(out)
+    for number, code in ((errno.ENOSPC, "storage_full"), (errno.EACCES, "output_not_writable")):
 
-    def refuse(*_: object, **__: object) -> None:
-        raise OSError(number, os.strerror(number))
+        def refuse(*_: object, number: int = number, **__: object) -> None:
+            raise OSError(number, os.strerror(number))
 
-    with monkeypatch.context() as patched:
-        patched.setattr(register_stage, step, refuse)
-        assert run_refused(small.photos, small.header, out, "--r-pc", "1.0")["code"] == code
-    assert tree_of(out) == before
+        with monkeypatch.context() as patched:
+            patched.setattr(register_stage, step, refuse)
+            assert run_refused(small.photos, small.header, out, "--r-pc", "1.0")["code"] == code
+        assert tree_of(out) == before
     assert specimap("run", "--photos", small.photos, "--cube", small.header, "--out", out, "--r-pc", "1.0").status == 0
 
 

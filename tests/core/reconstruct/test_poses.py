@@ -19,7 +19,7 @@ from specimap_core.reconstruct.features.sift import Sift
 from specimap_core.reconstruct.poses import Posed, pose_photos
 from tests.support.feature_scene import Ring, ring
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("remembered_sift")]
 
 SHOWN = [0, 1, 2, 3]
 ALL = list(range(10))

@@ -16,7 +16,7 @@ from specimap_core.reconstruct.features.sift import Sift, extract, match
 from specimap_core.reconstruct.resection import Locator
 from tests.support.scenes import OnDisk, rotation_deg
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("remembered_sift")]
 
 TARGET = np.array([0.0, 0.0, 3.0])
 
