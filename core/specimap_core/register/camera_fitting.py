@@ -120,7 +120,11 @@ def fit(
     start: View, model: Model, observed: CubeObservations, *, motion: bool = False, free: int | None = None
 ) -> CameraFit:
     """Fit ``model`` from ``start``; with ``motion`` the specimen may have moved. ``free``: how many of the model's
-    parameters are free, from the first; all by default."""
+    parameters are free, from the first; all by default.
+
+    Raises:
+        RegistrationError: the fit ends with a scan's camera below the markers.
+    """
     free = model.free if free is None else free
     many = free + (3 if motion else 0)
     weight = 1 / np.maximum(observed.sigma_px, 1e-3)[:, None]

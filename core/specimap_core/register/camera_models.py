@@ -95,16 +95,30 @@ def apply_step(view: View, x: Floats) -> View:
 
 
 def at_markers(view: View) -> View:
-    """The same camera, the aspect of a scan's pixels counted at the depth of the markers."""
+    """The same camera, the aspect of a scan's pixels counted at the depth of the markers.
+
+    Raises:
+        RegistrationError: a scan's camera lies below the markers.
+    """
     if not isinstance(view, ScanView):
         return view
     depth = float(view.cam_from_world.t[2])
+    if depth <= 0:
+        raise no_camera_above()
     lens, ratio = view.intrinsics, view.depth_mm / depth
     if view.along == 1:
         lens = replace(lens, aspect=lens.aspect * ratio)
     else:
         lens = replace(lens, focal_px=lens.focal_px / ratio, aspect=lens.aspect / ratio)
     return replace(view, intrinsics=lens, depth_mm=depth)
+
+
+def no_camera_above() -> RegistrationError:
+    """The error where the cube shows the markers as no camera above them can."""
+    return RegistrationError(
+        "No camera above the markers sees them as the cube does.",
+        advice="Check that cube and photos show the same, unmoved markers.",
+    )
 
 
 def prior_residuals(view: View) -> list[float]:
@@ -136,10 +150,7 @@ class PlaneAffinity:
         """
         answer = np.linalg.lstsq(np.c_[corners[:, :2], np.ones(len(corners))], pixels, rcond=None)[0].T
         if not np.isfinite(answer).all() or np.linalg.det(answer[:, :2]) >= 0:
-            raise RegistrationError(
-                "No camera above the markers sees them as the cube does.",
-                advice="Check that cube and photos show the same, unmoved markers.",
-            )
+            raise no_camera_above()
         return PlaneAffinity(np.asarray(answer[:, :2], float), np.asarray(answer[:, 2], float))
 
     @property

@@ -9,6 +9,7 @@ another explains clearly more.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +27,7 @@ from specimap_core.register.camera_models import (
     Model,
     PlaneAffinity,
     in_square_pixels,
+    no_camera_above,
 )
 from specimap_core.register.cube_camera import CubeCamera, solve_camera
 from specimap_core.register.tile_offsets import TileOffsets
@@ -103,10 +105,10 @@ def select_camera(
         RegistrationError: no kind of camera sees the corners there.
     """
     starts = _starts(observed, rows, cols, square)
-    by_corners = {model: fit(view, model, observed) for model, view in starts.items()}
+    by_corners = {model: fitted for (model, _), fitted in _fits(starts, observed, (False,)).items()}
     # Corners err together with the layout: what the best kind leaves of them is how far they can be trusted.
     observed = observed.with_inflated_corner_sigma(max(1.0, min(f.scatter for f in by_corners.values())))
-    now = {(model, False): fit(f.camera.view, model, observed) for model, f in by_corners.items()}
+    now = _fits({model: f.camera.view for model, f in by_corners.items()}, observed, (False,))
     best = _cheapest(now)
     seen: TileOffsets | None = None
     for _ in range(ROUNDS):
@@ -162,6 +164,24 @@ def _first_offsets(measure: MeasureOffsets, views: Sequence[View]) -> TileOffset
     return None
 
 
+def _fits(
+    views: dict[Model, View], observed: CubeObservations, motions: Sequence[bool]
+) -> dict[tuple[Model, bool], CameraFit]:
+    """Fit each model from its view, with a specimen that stayed or moved; those that end in no camera are left out.
+
+    Raises:
+        RegistrationError: all do.
+    """
+    fits = {}
+    for model, view in views.items():
+        for moved in motions:
+            with suppress(RegistrationError):
+                fits[model, moved] = fit(view, model, observed, motion=moved)
+    if not fits:
+        raise no_camera_above()
+    return fits
+
+
 def _fit_all(
     views: dict[Model, View], observed: CubeObservations, seen: TileOffsets
 ) -> dict[tuple[Model, bool], CameraFit]:
@@ -169,11 +189,7 @@ def _fit_all(
     sigma_mm, fits = TILE_MM, {}
     for _ in range(2):
         whole = replace(observed, tiles=TileObservations.of(seen, sigma_mm))
-        fits = {
-            (model, moved): fit(view, model, whole, motion=moved)
-            for model, view in views.items()
-            for moved in (False, True)
-        }
+        fits = _fits(views, whole, (False, True))
         closest = min(fits.values(), key=lambda f: f.cost)
         sigma_mm = max(LEAST_TILE_MM, SIGMA_OF_MAD * float(np.median(np.abs(closest.tile_miss))) * sigma_mm)
     return fits

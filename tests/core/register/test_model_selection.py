@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from specimap_core.errors import RegistrationError, SpecimapError
@@ -113,6 +113,7 @@ def test_a_marker_left_out_of_a_scan_is_placed_by_the_others(axis: Axis) -> None
     st.sampled_from([(0, 1, 2, 3), (0, 1, 2), (0, 1), (3,)]),
     st.sampled_from([0.0, 0.02, 3.0]),
 )
+@example(1 / 3, -0.353034124221959, 1e-44, 0.0, False, (3,), 3.0)  # a scan's camera ends below the markers
 def test_whatever_the_corners_show_ends_in_a_camera_or_a_refusal(
     aspect: float, x: float, y: float, turn: float, mirrored: bool, ids: tuple[int, ...], noise_px: float
 ) -> None:
