@@ -38,7 +38,7 @@ $(RUN)/python:
 $(STAMP): pyproject.toml client/pyproject.toml requirements.lock | $(RUN)/python
 	@$(RUN)/python -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 		echo "$(VENV) holds $$($(RUN)/python -V 2>&1); Specimap needs 3.11 or later. Remove $(VENV) and run make again." >&2; exit 1; }
-	@echo "Installing into $(VENV) (about 2.5 GB on disk; some minutes the first time)"
+	@echo "Installing into $(VENV) (about 3 GB on disk; some minutes the first time)"
 	@$(RUN)/python -m pip install --quiet --disable-pip-version-check --requirement requirements.lock
 	@$(RUN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable . --editable client
 	@touch $@

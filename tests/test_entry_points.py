@@ -21,7 +21,7 @@ READERS = {
     "cli/specimap_cli/doctor.py",
     "cli/specimap_cli/validation.py",
     "infra/specimap_infra/settings.py",
-    "service/specimap_service/context.py",
+    "service/specimap_service/acquisitions/dependencies.py",
     "workers/specimap_workers/__main__.py",
     "workers/specimap_workers/stage_main.py",
     # Scripts of processes of their own.
@@ -35,6 +35,7 @@ READERS = {
 """Modules that may look at the environment."""
 ENTRY_POINTS = (
     "specimap_cli",
+    "specimap_workers.__main__",
     "specimap_workers.stage_main",
     "specimap_workers.export_main",
     "specimap_core.screening.__main__",

@@ -43,7 +43,7 @@ def demo(samples: Path, out: Path, listener: Listener, *, stay: bool, say: Calla
     if not photos or not cube.is_file():
         raise NotFoundError(f"{samples} holds no sample.", advice="Name the folder samples/ of the source.")
     with _service(out / "service") as (url, key):
-        say(f"A service of its own listens on {url}")
+        say(f"The demo's service listens on {url}")
         try:
             with Client(url, key) as client:
                 _run(client, photos, cube, out, listener, say)

@@ -68,7 +68,7 @@ class ServiceSettings(BaseSettings):
 
     max_photo_bytes: int = Field(default=64 * MIB, ge=1, description="Largest photo.")
     max_cube_bytes: int = Field(default=8 * GIB, ge=1, description="Largest cube file.")
-    max_photos: int = Field(default=300, ge=1, description="Most photos of one acquisition.")
+    max_photos: int = Field(default=300, ge=1, description="Largest number of photos of one acquisition.")
     quota_bytes: int = Field(
         default=200 * GIB,
         ge=1,
@@ -82,7 +82,7 @@ class ServiceSettings(BaseSettings):
     upload_hours: float = Field(default=48, gt=0, description="Hours after which an unfinished upload is dropped.")
     judge_seconds: float = Field(default=60, gt=0, description="Longest time that the judging of one file may take.")
     judge_memory_bytes: int = Field(
-        default=3 * GIB, ge=256 * MIB, description="Most memory that the judging of files may take."
+        default=3 * GIB, ge=256 * MIB, description="Largest memory that the judging of files may take."
     )
 
     sandbox: Mode = Field(
@@ -109,7 +109,7 @@ class ServiceSettings(BaseSettings):
     patience_seconds: float = Field(
         default=300,
         gt=0,
-        description="How long a worker waits for a database or a storage that is away before it gives a job up.",
+        description="How long a worker waits for an unreachable database or storage before it gives up a job.",
     )
 
     webhook_hosts: list[str] = Field(
@@ -119,7 +119,7 @@ class ServiceSettings(BaseSettings):
     webhook_attempts: int = Field(default=8, ge=1, description="Attempts to deliver a webhook, at growing intervals.")
 
     log_level: Literal["debug", "info", "warning", "error"] = Field(
-        default="info", description="Least level that is logged."
+        default="info", description="Lowest level that is logged."
     )
     log_format: Literal["json", "text"] = Field(
         default="json", description="One JSON object a line, or lines for a person."

@@ -8,18 +8,22 @@ import shlex
 import sys
 
 from specimap_core.errors import SpecimapError
-from specimap_core.reconstruct.backends.environment import backends_from
 from specimap_core.sandbox import hide_from_others
 from specimap_core.sandbox.lifetime import die_with
-from specimap_infra.database import Database
-from specimap_infra.logs import logger, set_up_logs
-from specimap_infra.migrate import migrate
-from specimap_infra.settings import load_settings
-from specimap_workers.stage_process import COMMAND
+from specimap_core.threads import limit_blas_threads
 
 
 def main() -> int:
     """Run a worker until it is stopped; 2 where it cannot start."""
+    limit_blas_threads()
+    # Imported after that, since some load numpy.
+    from specimap_core.reconstruct.backends.environment import backends_from
+    from specimap_infra.database import Database
+    from specimap_infra.logs import logger, set_up_logs
+    from specimap_infra.migrate import migrate
+    from specimap_infra.settings import load_settings
+    from specimap_workers.stage_process import COMMAND
+
     parser = argparse.ArgumentParser(prog="python -m specimap_workers")
     parser.add_argument("--slot", type=int, default=0)
     parser.add_argument("--kind", choices=("cpu", "gpu"), default="cpu")

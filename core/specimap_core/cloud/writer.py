@@ -224,7 +224,8 @@ def _create(group: Path, name: str, shape: Sequence[int], attributes: dict[str, 
     array = tensorstore.open(
         {
             "driver": "zarr3",
-            "kvstore": {"driver": "file", "path": f"{group / name}/"},
+            # It refuses paths with "..".
+            "kvstore": {"driver": "file", "path": f"{(group / name).resolve()}/"},
             "context": {"file_io_sync": durable},
             # A missing file then always means damage.
             "store_data_equal_to_fill_value": True,

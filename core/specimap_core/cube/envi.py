@@ -72,6 +72,7 @@ class EnviFormat:
 
     name = "ENVI"
     suffixes: tuple[str, ...] = (_HEADER_SUFFIX, *_DATA_SUFFIXES)
+    stored_suffix: str | None = None
 
     def matches(self, path: Path) -> bool:
         suffix = path.suffix.lower()

@@ -39,6 +39,7 @@ class HdfFormat:
 
     name = "HDF5"
     suffixes: tuple[str, ...] = (".h5", ".hdf5", ".hdf", ".he5", ".nc", ".nc4", ".mat")
+    stored_suffix: str | None = ".h5"
 
     def matches(self, path: Path) -> bool:
         return bool(h5py.is_hdf5(path))

@@ -33,6 +33,7 @@ class Matlab5Format:
 
     name = "MATLAB 5"
     suffixes: tuple[str, ...] = (".mat",)
+    stored_suffix: str | None = ".mat"
 
     def matches(self, path: Path) -> bool:
         return starts_with(path, _MAGIC)

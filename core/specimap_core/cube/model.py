@@ -127,10 +127,13 @@ def digest_files(files: Sequence[Path]) -> str:
 
 
 class CubeFormat(Protocol):
-    """A file format. Another one is one small class in the list of :mod:`specimap_core.cube.opening`."""
+    """A file format. Another one is one small class in the list of :mod:`specimap_core.cube.opening`, from which a run
+    and the judging of uploads take it."""
 
     name: str
     suffixes: tuple[str, ...]
+    stored_suffix: str | None
+    """Of an uploaded file that is the whole cube and known by how it begins; None where it is told another way."""
 
     def matches(self, path: Path) -> bool:
         """Whether the file at ``path`` (it exists) is of this format; cheap, never raises for bad content."""

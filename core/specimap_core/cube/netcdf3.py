@@ -24,6 +24,7 @@ class NetCdf3Format:
 
     name = "NetCDF3"
     suffixes: tuple[str, ...] = (".nc", ".cdf")
+    stored_suffix: str | None = ".nc"
 
     def matches(self, path: Path) -> bool:
         return any(starts_with(path, magic) for magic in _NETCDF3_MAGIC)

@@ -88,6 +88,7 @@ class NpyFormat:
 
     name = "NumPy"
     suffixes: tuple[str, ...] = (".npy",)
+    stored_suffix: str | None = ".npy"
 
     def matches(self, path: Path) -> bool:
         return starts_with(path, _NPY_MAGIC)
@@ -116,6 +117,7 @@ class NpzFormat:
 
     name = "NumPy archive"
     suffixes: tuple[str, ...] = (".npz",)
+    stored_suffix: str | None = None
 
     def matches(self, path: Path) -> bool:
         return starts_with(path, _ZIP_MAGIC) and path.suffix.lower() in self.suffixes

@@ -55,6 +55,7 @@ class TiffFormat:
 
     name = "TIFF"
     suffixes: tuple[str, ...] = (".tif", ".tiff", ".btf")
+    stored_suffix: str | None = ".tif"
 
     def matches(self, path: Path) -> bool:
         return any(starts_with(path, magic) for magic in _MAGIC)

@@ -26,6 +26,8 @@ TAIL_LINES, TAIL_LINE_LENGTH = 40, 500
 TAIL_BYTES = TAIL_LINES * TAIL_LINE_LENGTH
 END_SECONDS = 10.0
 """Longest wait for a killed process: one that the kernel cannot end is left."""
+SILENT_SECONDS = 2.0
+"""How long a process may go on after it has closed its messages: it can answer no more."""
 _PIECE_BYTES = 1 << 16
 _MOST_PIECES = 32
 """More than a pipe holds: a child that never stops writing does not hold up its parent."""
@@ -77,6 +79,7 @@ class JsonLineProcess:
         self._closed = False
         self._received, self._searched = bytearray(), 0
         self._recent = b""
+        self._silent_since = 0.0
         self._messages, childs_end = os.pipe()
         try:
             with open(log, "wb") if log else nullcontext() as output:
@@ -143,7 +146,7 @@ class JsonLineProcess:
         Raises:
             TimeoutError: there was none within ``seconds``.
             InvalidMessageError: the next line is none.
-            ProcessEndedError: there are no more.
+            ProcessEndedError: there are no more; the status is 0 where it has closed its messages and runs on.
         """
         deadline = time.monotonic() + seconds
         with self._lock:
@@ -199,6 +202,8 @@ class JsonLineProcess:
             piece = os.read(pipe, _PIECE_BYTES)
             if not piece:
                 self._open.discard(pipe)
+                if pipe == self._messages:
+                    self._silent_since = time.monotonic()
             elif pipe == self._messages:
                 self._received += piece
             else:
@@ -211,6 +216,8 @@ class JsonLineProcess:
         with suppress(subprocess.TimeoutExpired):
             status = self._process.wait(max(0.0, min(seconds, _END_POLL_SECONDS)))
             raise ProcessEndedError(status, self._tail())
+        if time.monotonic() - self._silent_since > SILENT_SECONDS:
+            raise ProcessEndedError(0, self._tail())
 
     def _next_line(self) -> bytes | None:
         end = self._received.find(b"\n", self._searched)

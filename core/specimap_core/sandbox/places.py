@@ -135,7 +135,9 @@ def _module_folders(data: Sequence[Path]) -> Iterator[Path]:
     """Folders of modules, but none that holds other things too: where data lie, or where the program was started."""
     yield from _own_packages()
     main = getattr(sys.modules.get("__main__"), "__file__", None)
+    # Of the source's folders the packages alone: a stray file next to one is not the program's.
     left_out = {_real(Path(os.curdir)), *([_real(Path(main)).parent] if main else [])}
+    left_out |= {_real(package.parent) for package in _own_packages()}
     for place in map(Path, filter(None, sys.path)):
         if _real(place) not in left_out and not any(_real(place) in path.parents for path in data):
             yield place

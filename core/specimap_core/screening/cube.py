@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from specimap_core.arrays import Floats
 from specimap_core.cube import FORMATS, Cube, inspect, open_cube
+from specimap_core.cube.envi import EnviFormat
 from specimap_core.cube.envi_header import EnviHeader, is_envi_header, read_header
 from specimap_core.cube.npy import starts_with
 from specimap_core.cube.pixels import sampled_rows
@@ -20,9 +21,13 @@ from specimap_core.notices import Notices
 from specimap_core.screening.verdict import Verdict
 
 Part = Literal["header", "data", "whole"]
-WHOLE_SUFFIXES = {"HDF5": ".h5", "NetCDF3": ".nc", "MATLAB 5": ".mat", "NumPy": ".npy", "TIFF": ".tif"}
-"""Formats that are known by how a file begins."""
-CLAIMED_WHOLE = frozenset({".h5", ".hdf5", ".he5", ".nc", ".nc4", ".cdf", ".mat", ".npy", ".npz", ".tif", ".tiff"})
+AMBIGUOUS_SUFFIXES = frozenset({".hdf", ".btf"})
+"""Ends of names that other files have too: such a file may be an ENVI cube's data."""
+CLAIMED_WHOLE = (
+    frozenset(suffix for known in FORMATS if known.name != EnviFormat.name for suffix in known.suffixes)
+    - AMBIGUOUS_SUFFIXES
+)
+"""A file whose name ends so is a whole cube, or refused."""
 ZIP_MAGIC = b"PK\x03\x04"
 SAMPLED_ROWS = 48
 MEAN_BANDS = 8
@@ -46,8 +51,8 @@ def judge_part(path: Path, claimed: str, expected_bytes: int | None) -> Verdict:
         except SpecimapError as error:
             return _refused(error, path, facts)
     for known in FORMATS:
-        if known.name in WHOLE_SUFFIXES and known.matches(path):
-            return Verdict(facts={"part": "whole", "suffix": WHOLE_SUFFIXES[known.name]})
+        if known.stored_suffix is not None and known.matches(path):
+            return Verdict(facts={"part": "whole", "suffix": known.stored_suffix})
     if starts_with(path, ZIP_MAGIC) and claimed == ".npz":
         return Verdict(facts={"part": "whole", "suffix": ".npz"})
     if claimed in CLAIMED_WHOLE:

@@ -18,6 +18,7 @@ from specimap_core.cloud import writer as writer_module
 from specimap_core.cloud.writer import write_cloud
 from specimap_core.errors import RegistrationError, StorageFullError
 from tests.support.cloud_scene import FakeCube, counts, scene
+from tests.support.places import ROOT
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +52,14 @@ def test_tiles_are_contiguous(rows: int, cols: int) -> None:
 
 
 # ---- encoding -------------------------------------------------------------------------------------------
+
+
+def test_a_path_with_dots_is_written_to(tmp_path: Path, cube: FakeCube, points: CloudPoints) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "a")
+    target = tmp_path / "link" / ".." / "link" / "cloud.zarr"
+    write_cloud(target, points, cube, {})
+    assert len(Cloud.open(tmp_path / "a" / "cloud.zarr").xyz) == len(points)
 
 
 def test_several_shards(tmp_path: Path, cube: FakeCube, points: CloudPoints, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -241,7 +250,7 @@ def test_a_cloud_is_replaced(tmp_path: Path, cube: FakeCube, points: CloudPoints
 _FILE_TOO_LARGE = """
 import resource, sys
 from pathlib import Path
-from cloud_scene import FakeCube, counts, scene
+from tests.support.cloud_scene import FakeCube, counts, scene
 from specimap_core.cloud.writer import write_cloud
 from specimap_core.errors import StorageFullError
 resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))
@@ -254,9 +263,8 @@ except StorageFullError as error:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits the size of files as Linux does")
 def test_the_writers_own_disk_error_is_typed(tmp_path: Path) -> None:
-    here = Path(__file__).parent
     done = subprocess.run(
-        [sys.executable, "-c", _FILE_TOO_LARGE, str(tmp_path)], cwd=here, capture_output=True, text=True, check=False
+        [sys.executable, "-c", _FILE_TOO_LARGE, str(tmp_path)], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert done.stdout.startswith("full:"), done.stderr
     assert list(tmp_path.iterdir()) == []

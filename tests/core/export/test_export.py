@@ -22,7 +22,7 @@ from specimap_core.export import EXPORTERS, ExportFormat, envi, export_cloud
 from tests.support.cloud_scene import FakeCube, counts, scene
 
 HOLDING = [format for format in EXPORTERS if format not in ("html", "pdf")]
-"""Formats that hold the cloud; the others are the report on it, which tests/test_document.py is about."""
+"""Formats that hold the cloud; the others are the report on it, which tests/core/report/test_document.py is about."""
 
 
 def make(path: Path, points: CloudPoints, cube: FakeCube) -> Cloud:

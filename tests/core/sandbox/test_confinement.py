@@ -11,7 +11,7 @@ import pytest
 
 from specimap_core.errors import SettingsError
 from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES, backends_from
-from specimap_core.sandbox import Protection, Reach, confined, program_rules, protection
+from specimap_core.sandbox import Protection, Reach, confined, landlock, program_rules, protection
 from specimap_core.sandbox.launch import NOT_CONFINED
 from specimap_core.sandbox.places import interpreter_places
 from specimap_infra import confinement
@@ -129,6 +129,18 @@ def test_no_rule_covers_a_private_place(tmp_path: Path, monkeypatch: pytest.Monk
     assert not {str(modules), str(modules / "data")} & set(named)
     monkeypatch.chdir(tmp_path / "plain")
     assert str(tmp_path / "plain") not in [place for place, _ in program_rules(Reach())]
+
+
+def test_of_a_source_folder_the_package_alone_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = tmp_path / "service" / "specimap_other"
+    package.mkdir(parents=True)
+    (package / "__init__.py").write_text("")
+    (package.parent / "notes").write_text("")
+    monkeypatch.syspath_prepend(str(package.parent))
+    rights = dict(program_rules(Reach()))
+    assert rights[str(package)] == landlock.READ
+    assert rights[str(package.parent)] == landlock.READ_DIR
+    assert str(package.parent / "notes") not in rights
 
 
 def test_an_interpreter_in_a_home_folder_opens_no_more_than_itself(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from specimap_core.sandbox import json_lines
 from specimap_core.sandbox.json_lines import (
     LINE_LIMIT,
     TAIL_LINE_LENGTH,
@@ -265,6 +266,16 @@ def test_a_process_that_closes_its_output_has_not_ended() -> None:
         with pytest.raises(ProcessEndedError) as caught:
             process.receive(PATIENCE_SECONDS)
         assert caught.value.status == 5
+
+
+def test_a_process_that_closes_its_output_and_runs_on_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(json_lines, "SILENT_SECONDS", 0.3)
+    with start("os.write(2, b'bye'); os.close(1); time.sleep(600)") as process:
+        with pytest.raises(ProcessEndedError) as caught:
+            process.receive(PATIENCE_SECONDS)
+        assert (caught.value.status, caught.value.tail) == (0, ["bye"])
+        pid = process.pid
+    assert is_gone(pid)
 
 
 @pytest.mark.parametrize("how", ["running", "ended"])
