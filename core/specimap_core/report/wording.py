@@ -90,6 +90,7 @@ REFUSAL_ADVICE = {
     "photo_blurred": "Take it again from the same side: tap to focus, hold still.",
     "photo_foreign": "Leave it out if it shows something else; else show the markers in it.",
     "photo_unlocated": "Take it again with two or more markers in view, between its neighbours.",
+    "photo_ambiguous": "Take it again with two or more markers in view, between its neighbours.",
 }
 GRAVE = (
     "specimen_moved",
