@@ -69,6 +69,7 @@ def bare(absent: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 def test_results_are_read_and_exported(absent: str, finished: Finished, tmp_path: Path) -> None:
     assert bare(absent, "--version").returncode == 0
     assert bare(absent, "info", str(finished.out)).returncode == 0
@@ -79,6 +80,7 @@ def test_results_are_read_and_exported(absent: str, finished: Finished, tmp_path
         assert target.stat().st_size > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "extra"),
     [

@@ -92,6 +92,7 @@ def test_checkout_weights_and_interpreter_are_looked_at(tmp_path: Path, bare: py
     assert any("/nowhere/python" in s for s in output)
 
 
+@pytest.mark.slow
 def test_a_setting_that_does_not_read_is_told(bare: pytest.MonkeyPatch) -> None:
     bare.setenv("SPECIMAP_MAST3R_GRAPH", "all")
     status, out = ask()
@@ -100,6 +101,7 @@ def test_a_setting_that_does_not_read_is_told(bare: pytest.MonkeyPatch) -> None:
     assert "It takes auto, complete or swin-K." in out
 
 
+@pytest.mark.slow
 def test_a_wrong_device_says_nothing_of_the_networks(bare: pytest.MonkeyPatch) -> None:
     bare.setenv("SPECIMAP_DENSE_DEVICE", "cuda")
     assert "SPECIMAP_DENSE_DEVICE" not in ask()[1]

@@ -75,6 +75,7 @@ def test_expiry_and_table(tmp_path: Path) -> None:
     assert done.stdout.strip().rsplit("_", 1)[1] not in table
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [

@@ -167,6 +167,7 @@ def test_events_of_a_run_without_figures_are_json(
     assert [strictly(line)["event"] for line in lines] == ["progress", "finished", "finished"]
 
 
+@pytest.mark.slow
 def test_commands_on_a_folder_without_figures_print_json(empty: Report, tmp_path: Path) -> None:
     out = folder_of(tmp_path / "out", empty)
     # As a version left it that wrote what Python writes.

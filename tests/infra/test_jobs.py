@@ -103,6 +103,7 @@ WRITES: dict[str, Callable[[Session, str], object]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("write", WRITES.values(), ids=WRITES)
 @pytest.mark.parametrize("how", ["taken over", "released", "cancelled"])
 def test_worker_that_lost_the_job_changes_nothing(

@@ -250,6 +250,7 @@ def test_forms_that_are_none(service: Running, body: bytes) -> None:
     assert list((service.settings.scratch / "uploads").iterdir()) == []
 
 
+@pytest.mark.slow
 def test_forms_within_limits(tmp_path: Path) -> None:
     limits: dict[str, Any] = {"max_photo_bytes": 200_000, "max_cube_bytes": 500_000, "max_photos": 2}
     with serving(tmp_path, **limits) as service:

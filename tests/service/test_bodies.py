@@ -169,6 +169,7 @@ def test_files_alone_have_limits_of_their_own(shared: Running) -> None:
                 assert "application/json" not in content, path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunked", [False, True])
 def test_memory_stays_while_a_stranger_sends(tmp_path: Path, chunked: bool) -> None:
     key = key_in(tmp_path)

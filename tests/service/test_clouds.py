@@ -198,6 +198,7 @@ def delete_rows(service: Running, result: Result) -> None:
         assert session.get(CloudRow, result.cloud_id) is None
 
 
+@pytest.mark.slow
 def test_a_deleted_cloud_is_gone_within_two_seconds(service: Running, result: Result) -> None:
     reader, here = service.client(("read",)), f"/v1/clouds/{result.cloud_id}"
     assert reader.get(f"{here}/points/3").status_code == 200
@@ -241,6 +242,7 @@ def test_a_lookup_that_a_change_overtook_is_not_kept(
         own.record(result.cloud_id)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", ["shard", "index", "group", "metadata"])
 def test_a_damaged_cloud_says_so_without_naming_files(service: Running, result: Result, damage: str) -> None:
     name = {"shard": "spectra/c/0/0", "index": "spectra/c/0/0", "group": "zarr.json", "metadata": "flags/zarr.json"}

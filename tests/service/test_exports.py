@@ -113,6 +113,7 @@ def test_las(service: Running, client: httpx.Client, result: Result) -> None:
     np.testing.assert_array_equal(np.stack([las["hsi_row"], las["hsi_col"]], 1), result.cloud.hsi_pixel)
 
 
+@pytest.mark.slow
 def test_npz_and_csv(service: Running, client: httpx.Client, result: Result) -> None:
     cloud = result.cloud
     with np.load(io.BytesIO(made(service, client, result, "npz"))) as held:
@@ -122,6 +123,7 @@ def test_npz_and_csv(service: Running, client: httpx.Client, result: Result) -> 
     np.testing.assert_array_equal(np.rint(table[:, 13:] * 1e4), cloud.stored_spectra(slice(None)))
 
 
+@pytest.mark.slow
 def test_ply_and_meshes(service: Running, client: httpx.Client, result: Result, tmp_path: Path) -> None:
     def stored(format: str, name: str) -> Path:
         path = tmp_path / name
@@ -204,6 +206,7 @@ def test_content_in_ranges(service: Running, client: httpx.Client, result: Resul
     assert client.get(place, headers={"Range": f"bytes={len(whole)}-"}).status_code == 416
 
 
+@pytest.mark.slow
 def test_formats_of_the_function_and_unknown_ones(result: Result, tmp_path: Path) -> None:
     for format in FileFormat:
         assert make_export_file(result.local, format.value, tmp_path / format.value).is_file()

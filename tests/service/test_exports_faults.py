@@ -102,6 +102,7 @@ def test_a_process_that_is_killed_is_started_again_and_then_failed(
     assert nothing_left(service)
 
 
+@pytest.mark.slow
 def test_a_failed_one_is_tried_again_under_a_new_id(
     service: Running, client: httpx.Client, result: Result, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -123,6 +124,7 @@ def test_a_failed_one_is_tried_again_under_a_new_id(
     assert client.get(address(result, "mesh-stl")).json()["state"] == "succeeded"
 
 
+@pytest.mark.slow
 def test_another_worker_takes_over_and_the_first_changes_nothing(
     service: Running, client: httpx.Client, result: Result, slow: Callable[[], int], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -164,6 +164,7 @@ def test_a_file_that_leads_elsewhere_tells_nothing(kind: str, relative: bool, us
     assert not shows_secret(uploaded(usual.service, data, "x.tif" if kind == "ome" else "x.h5"))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not protection().whole, reason="this kernel does not confine")
 @pytest.mark.parametrize("kind", HOSTILE)
 def test_confinement_holds_alone_where_a_reader_would_follow(kind: str, naive: Beside, tmp_path: Path) -> None:
@@ -246,6 +247,7 @@ def test_photos_that_are_not_what_they_seem_tell_nothing(usual: Beside, tmp_path
     assert sent(client, acquisition, "photo", "good.jpg", photos()[0].read_bytes())["state"] == "accepted"
 
 
+@pytest.mark.slow
 def test_a_key_for_uploads_reads_no_database(service: Running) -> None:
     client = service.client(("upload",))
     acquisition = new_acquisition(client)

@@ -108,6 +108,7 @@ def test_stream_is_resumed_after_the_last_event_seen(service: Running) -> None:
     assert client.get(f"/v1/jobs/job_{'0' * 26}/events").status_code == 404
 
 
+@pytest.mark.slow
 def test_many_listeners_cost_one_look_into_the_database(service: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     looks: list[dict[str, int]] = []
     read = events.read_events

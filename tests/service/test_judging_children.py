@@ -128,6 +128,9 @@ def test_a_copy_that_ends_while_it_waits_is_no_fault_of_the_next_file(tmp_path: 
         children = Path(f"/proc/{child}/task/{child}/children")
         (waiting,) = until(lambda: children.read_text().split(), 20, "the next copy")
         os.kill(int(waiting), signal.SIGKILL)
+        # A signal takes a moment, in which the copy could still be given the next file.
+        stat = Path(f"/proc/{waiting}/stat")
+        until(lambda: not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] == "Z", 20, "its end")
         for _ in range(4):  # each of the two children is asked
             assert judge.cube(folder / "good")["verdict"] == "accepted"
     finally:

@@ -210,6 +210,7 @@ def wrong_bodies() -> list[tuple[str, str, dict[str, str], Callable[[NDArray[np.
     ]
 
 
+@pytest.mark.slow
 def test_what_does_not_fit_is_refused_and_leaves_nothing(
     service: Running, result: Result, values: NDArray[np.int64]
 ) -> None:

@@ -67,6 +67,7 @@ def test_round_trip(service: Running, client: httpx.Client, result: Result, tmp_
     assert pdf.content == write_document(result.local, tmp_path / "own.pdf", "pdf").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_result_of_an_older_version(service: Running, client: httpx.Client, result: Result) -> None:
     service.storage.delete(f"{result.prefix}/preview.png")
     page = Page(made(service, client, result, "html").text)
@@ -74,6 +75,7 @@ def test_a_result_of_an_older_version(service: Running, client: httpx.Client, re
     assert len(page.images) == 6
 
 
+@pytest.mark.slow
 def test_spectra_are_not_fetched(
     service: Running, client: httpx.Client, result: Result, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -99,6 +101,7 @@ def test_a_stored_report_that_is_damaged(service: Running, client: httpx.Client,
     assert str(service.settings.scratch) not in json.dumps(described)
 
 
+@pytest.mark.slow
 def test_the_api_draws_nothing() -> None:
     code = "import sys, specimap_service.app\nprint([m for m in ('matplotlib', 'reportlab') if m in sys.modules])"
     described = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)

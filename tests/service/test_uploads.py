@@ -128,6 +128,7 @@ def test_only_the_key_that_created_it_or_an_administrator(service: Running) -> N
     assert offset_of(admin, at) == 10
 
 
+@pytest.mark.slow
 def test_checksums(service: Running) -> None:
     client = service.client()
     acquisition = new_acquisition(client)

@@ -20,6 +20,7 @@ from tests.support.upload_scene import BreakingProxy, new_acquisition, photos, r
 JS_CLIENT = SUPPORT / "tus_client"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slash", ["", "/"])
 @pytest.mark.parametrize("checksum", [False, True])
 def test_tuspy_sends_a_photo_and_a_cube(service: Running, slash: str, checksum: bool) -> None:
@@ -51,6 +52,7 @@ def js_client(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunk", [0, 1_500_000])
 def test_tus_js_client_goes_on_where_the_network_broke(
     service: Running, js_client: Path, chunk: int, tmp_path: Path

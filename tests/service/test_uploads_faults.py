@@ -137,6 +137,7 @@ def test_a_process_that_died_after_the_last_byte(service: Running, ask: str) -> 
     assert list((service.settings.scratch / "uploads").iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_storage_that_fails_at_the_end_keeps_the_bytes(service: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     client = service.client()
     at = created(client, new_acquisition(client), "photo", len(PHOTO))
@@ -228,6 +229,7 @@ def test_a_dead_connection_gives_way(service: Running, monkeypatch: pytest.Monke
     assert result(client, at)["file"]["sha256"] == hashlib.sha256(data).hexdigest()
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up_in_the_middle(tmp_path: Path) -> None:
     data = noise(20_000_000)
     key = key_in(tmp_path)

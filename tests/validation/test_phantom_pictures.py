@@ -40,6 +40,7 @@ def area(polygon: Floats) -> float:
     return float(abs((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()) / 2)
 
 
+@pytest.mark.slow
 def test_markers_are_detected_where_the_truth_projects_them(phantom: Phantom, photos: list[NDArray[np.uint8]]) -> None:
     errors, seen = [], 0
     for image, view in zip(photos, phantom.truth.views, strict=True):

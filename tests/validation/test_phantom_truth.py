@@ -57,6 +57,7 @@ def test_a_seed_repeats_and_another_differs(tmp_path: Path) -> None:
         assert (first == other) == (file.suffix == ".hdr")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("interleave", "axes"), [("bsq", (1, 2, 0)), ("bil", (0, 2, 1)), ("bip", (0, 1, 2))])
 def test_the_cube_is_written_as_its_header_says(tmp_path: Path, interleave: str, axes: tuple[int, int, int]) -> None:
     write_phantom(TINY, tmp_path, interleave=interleave, photo_format="png")

@@ -84,6 +84,7 @@ def test_refined_poses_put_exact_depth_where_it_is(
     assert 1e-3 < float(np.median(adjusted_errors_mm(found, seen, small.truth, "free"))) < CLOSE_MM
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.98, 1.02])
 def test_a_wrong_focal_length_stays_in_the_published_cloud(
     seen: Seen, small: OnDisk, settings: Mast3rSettings, monkeypatch: pytest.MonkeyPatch, factor: float
@@ -113,6 +114,7 @@ def test_a_photo_that_is_placed_wrongly_is_placed_by_its_markers(
     assert seen.photos[5].name in messages(found.warnings)["depth_unaligned"]
 
 
+@pytest.mark.slow
 def test_a_run_with_free_corners_goes_the_published_way(
     seen: Seen, small: OnDisk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

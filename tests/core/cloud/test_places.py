@@ -44,6 +44,7 @@ def lies_in(row: int, col: int, outline: list[list[Fraction]]) -> bool:
 GRID = np.moveaxis(np.mgrid[0:14, 0:12], 0, -1).reshape(-1, 2).astype(np.uint16)
 
 
+@pytest.mark.slow
 @given(nps.arrays(np.int64, st.tuples(st.integers(3, 8), st.just(2)), elements=st.integers(-8, 34)))
 @settings(max_examples=300, deadline=None)
 def test_polygon_by_the_even_odd_rule(halves: np.ndarray) -> None:

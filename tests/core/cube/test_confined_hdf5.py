@@ -79,6 +79,7 @@ ROLES: dict[str, tuple[int, ...]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("role", ROLES)
 @pytest.mark.parametrize("matlab", [False, True])

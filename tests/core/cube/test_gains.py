@@ -19,6 +19,7 @@ from tests.support.stored_values import FORMATS, as_image, codes, flagged, truth
 from tests.support.value_files import WRITERS, listed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FORMATS)
 @pytest.mark.parametrize("form", ["one", "each", "gain", "offset"])
 def test_gains_and_offsets_give_reflectance_to_the_last_digit(tmp_path: Path, name: str, form: str) -> None:

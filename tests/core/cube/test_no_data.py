@@ -17,6 +17,7 @@ from tests.support.stored_values import FORMATS, as_image, codes, flagged, truth
 from tests.support.value_files import WRITERS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FORMATS)
 @pytest.mark.parametrize(
     ("dtype", "no_data"),

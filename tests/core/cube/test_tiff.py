@@ -24,6 +24,7 @@ def smooth(dtype: str) -> Values:
     return (100 + 3 * rows + 2 * cols + bands + rows * cols % 7).astype(dtype)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compression", LOSSLESS)
 @pytest.mark.parametrize("predictor", [False, True])
 @pytest.mark.parametrize("dtype", ["u1", "u2", "i4", "f4", "f8"])

@@ -192,6 +192,7 @@ def test_a_false_reading_in_one_photo_is_left_out() -> None:
     assert gathered(pictures) == (0, 1, 2, 3)
 
 
+@pytest.mark.slow
 def test_another_dictionary_is_named_even_where_the_given_one_reads_a_few() -> None:
     pictures = [picture(LAYOUT, dictionary="DICT_6X6_250", seed=k) for k in range(6)]
     with pytest.raises(WrongDictionaryError) as refused:
@@ -204,6 +205,7 @@ def test_another_dictionary_is_named_even_where_the_given_one_reads_a_few() -> N
         gathered(pictures)
 
 
+@pytest.mark.slow
 def test_no_marker_anywhere_is_refused_as_that() -> None:
     rng = np.random.default_rng(1)
     greys = [

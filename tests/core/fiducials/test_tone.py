@@ -53,6 +53,7 @@ def test_photos_resized_as_encoded_keep_their_markers_size(make: object) -> None
     assert abs(after) < 0.3 * before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blur_px", [0.5, 1.0, 1.5])
 def test_what_a_lens_blurs_is_measured_in_linear_light(blur_px: float) -> None:
     grey = picture(LARGE, shape=(750, 1000), blur_px=blur_px)

@@ -63,6 +63,7 @@ def test_one_turned_photo_among_upright_ones(tmp_path: Path, kind: str, orientat
         assert np.abs(photo.image.astype(int) - expected).mean() < 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", WITH_EXIF)
 def test_large_turned_photos_come_to_working_size(tmp_path: Path, kind: str) -> None:
     stored = pattern(1200, 900)
@@ -84,6 +85,7 @@ def test_a_picture_without_exif_stays_as_it_is(tmp_path: Path) -> None:
 # ---- the one list -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", list(FORMATS))
 def test_what_is_stored_is_found_again(tmp_path: Path, kind: str) -> None:
     """An upload is stored under a suffix by its content, under which a job's folder shows it and a browser knows it."""

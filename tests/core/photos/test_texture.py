@@ -36,6 +36,7 @@ def shares(full: Phantom) -> dict[float, float]:
     return {1.0: share(full)} | {contrast: share(scene(contrast)) for contrast in (0.5, 0.25, 0.0)}
 
 
+@pytest.mark.slow
 def test_it_falls_with_the_tissues_texture_and_stays_between_its_bounds(shares: dict[float, float]) -> None:
     assert (-np.diff(list(shares.values())) > 0.02).all(), shares
     # At contrast 0 lobules and vessels are left; the tray is plain.

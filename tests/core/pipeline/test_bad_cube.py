@@ -91,6 +91,7 @@ def one_band(values: Values) -> Values:
     return values[..., 2:3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "code"), [(saturated, "saturated"), (dark_bands, "bands_all_zero"), (one_band, "single_band")]
 )
@@ -103,6 +104,7 @@ def test_cubes_with_flaws_are_used_with_a_warning(
     assert report.coverage.points > 5000
 
 
+@pytest.mark.slow
 def test_pixels_that_are_not_numbers(small: OnDisk, finished: Finished, tmp_path: Path) -> None:
     values = small.values().astype(np.float32) / 10000
     values[50:60, 40:80] = np.nan

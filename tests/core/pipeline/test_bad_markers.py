@@ -22,6 +22,7 @@ from tests.support.scenes import SMALL, OnDisk, phantom_on_disk, read_corners, r
 # ---- markers --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_no_marker_anywhere(small: OnDisk, tmp_path: Path) -> None:
     photos = copied(small.photos, tmp_path / "photos")
     for path in photos.iterdir():
@@ -29,6 +30,7 @@ def test_no_marker_anywhere(small: OnDisk, tmp_path: Path) -> None:
     assert run_refused(photos, small.header, tmp_path / "out")["code"] == "no_markers_found"
 
 
+@pytest.mark.slow
 def test_mirrored_photos_are_said_to_be_mirrored(small: OnDisk, tmp_path: Path) -> None:
     """As a phone's front camera stores them."""
     photos = copied(small.photos, tmp_path / "photos")
@@ -39,6 +41,7 @@ def test_mirrored_photos_are_said_to_be_mirrored(small: OnDisk, tmp_path: Path) 
     assert "mirrored" in str(refusal["message"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", ["DICT_5X5_50", "DICT_6X6_1000", "DICT_APRILTAG_16h5", "DICT_7X7_1000"])
 def test_markers_of_another_dictionary(small: OnDisk, tmp_path: Path, given: str) -> None:
     refusal = run_refused(small.photos, small.header, tmp_path / "out", "--dictionary", given)
@@ -87,6 +90,7 @@ def test_other_layouts_work(tmp_path: Path) -> None:
 # ---- scale ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("edge", "named"),
     [(0.3, "0.3 inches are 7.62 mm"), (0.268, "0.268 inches"), (0.68, "0.68 centimetres are 6.8 mm")],

@@ -124,6 +124,7 @@ def test_a_damaged_artefact_is_made_anew(finished: Finished, small: OnDisk, tmp_
     assert_same_result(out, finished.out)
 
 
+@pytest.mark.slow
 def test_the_published_forms_run_too(finished: Finished, small: OnDisk, tmp_path: Path) -> None:
     settings = PipelineSettings()
     settings = replace(

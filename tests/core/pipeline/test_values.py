@@ -58,6 +58,7 @@ def spectra_image(cloud: Cloud, shape: tuple[int, int]) -> tuple[Array, Array]:
     return spectra, flags
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["i2", "u2", "f4", "nan", "dead", "single", "gains", "factor", "negative"])
 def test_the_same_result_however_values_are_stored(
     small: OnDisk, finished: Finished, tmp_path: Path, name: str

@@ -169,6 +169,7 @@ def test_steady_layouts_stay_as_they_are(noise_px: float) -> None:
         assert (correct_focal_breathing(photos, corners, edge_mm=EDGE_MM, focal_px=None)[2] == 1).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["phantom_a", "phantom_hard"])
 def test_steady_path_traced_photos_stay_as_they_are(data_dir: Path, name: str) -> None:
     photos, _ = read_photos(photo_paths(data_dir / name / "rgb"), AcquisitionSettings(), workers=2)
@@ -181,6 +182,7 @@ def test_steady_path_traced_photos_stay_as_they_are(data_dir: Path, name: str) -
 # ---- corners and images go together -------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("zoom", [0.98, 1.015])
 def test_markers_of_a_warped_photo_lie_where_the_corners_were_brought(zoom: float) -> None:
     scene = shown(BREATHING_SEEDS[0], SPREAD)

@@ -27,6 +27,7 @@ def shown(blur_px: float) -> NDArray[np.uint8]:
     return picture(LARGE, shape=SHAPE, blur_px=blur_px)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blur_px", [0.5, 0.8, 1.2, 1.8])
 def test_the_blur_of_edges_is_measured(blur_px: float) -> None:
     blurs = edge_blurs(linear_from_srgb(shown(blur_px)), np.stack(list(LARGE.values())))
@@ -48,6 +49,7 @@ def test_sharp_photos_stay_as_they_are() -> None:
     assert there is found
 
 
+@pytest.mark.slow
 def test_soft_photos_are_brought_to_what_they_resolve() -> None:
     blur = 0.9
     photos = [photo(shown(blur), name) for name in "ab"]

@@ -90,6 +90,7 @@ def case(image: Singles, caster: RayCaster, ids: tuple[int, ...], noise_px: floa
 # ---- markers, and a textured bump ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_four_sharp_markers_hold_the_camera_and_the_specimen_agrees(
     caster: RayCaster, picture: Singles, seed: int
@@ -194,6 +195,7 @@ def test_a_run_with_two_markers_in_the_cube_is_settled(finished: Finished, small
     assert 0.02 < error.median < 1.3 * usual.median
 
 
+@pytest.mark.slow
 def test_a_run_states_that_the_specimen_moved_and_how_unsure_its_places_are(
     finished: Finished, small: OnDisk, tmp_path: Path
 ) -> None:

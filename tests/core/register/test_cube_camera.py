@@ -45,6 +45,7 @@ def test_where_perspective_shows_the_prior_has_no_say(focal_px: float) -> None:
     assert 0.3 < np.sqrt((off**2).mean()) < 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("aside_mm", "noise_px"), [(10.0, SHARP_PX), (150.0, 0.1)])
 def test_sideways_deviation_is_that_of_repeated_solutions(aside_mm: float, noise_px: float) -> None:
     view, raised = above(1600.0, aside_mm), np.array([[0.0, 0.0, 10.0]])

@@ -61,12 +61,14 @@ def above(aspect: float = 1.0, tilt_mm: float = 8.0) -> View:
 # ---- corners alone ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tilt_mm", [0.0, 8.0, 60.0])
 @pytest.mark.parametrize("noise_px", [0.02, 0.5])
 def test_square_pixels_are_left_square(noise_px: float, tilt_mm: float) -> None:
     assert {by_corners(above(tilt_mm=tilt_mm), noise_px, seed).model for seed in range(6)} == {FRAME}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("aspect", [0.3, 0.7, 0.97, 1.03, 1.4, 3.0])
 @pytest.mark.parametrize("ids", [(0, 1, 2, 3), (0, 1, 2), (0, 2)])
 def test_the_aspect_shows_in_the_corners(aspect: float, ids: tuple[int, ...]) -> None:
@@ -237,6 +239,7 @@ def test_a_specimen_that_moved_in_a_scan_is_noticed(finished: Finished, small: O
     assert judged.within(2) > 0.88
 
 
+@pytest.mark.slow
 def test_a_scan_that_wavers_is_no_motion_and_its_deviations_hold(
     finished: Finished, small: OnDisk, tmp_path: Path
 ) -> None:
@@ -249,6 +252,7 @@ def test_a_scan_that_wavers_is_no_motion_and_its_deviations_hold(
     assert judged.within(2) > 0.88
 
 
+@pytest.mark.slow
 def test_corners_of_a_cube_are_those_of_its_camera(finished: Finished, small: OnDisk, tmp_path: Path) -> None:
     report, _ = run_on(CUBES["lines of 0.7"], finished, small, tmp_path)
     assert report.cube_corners is not None

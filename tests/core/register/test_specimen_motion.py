@@ -60,6 +60,7 @@ def cube_of(settings: PhantomSettings, folder: Path) -> Cube:
 # ---- phantoms, by their own reconstruction ------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moved_mm", [(0.8, -0.6, 0.0), (-2.4, 1.8, 0.0)])
 def test_a_shift_is_noticed_and_measured(
     finished: Finished, tmp_path: Path, moved_mm: tuple[float, float, float]

@@ -126,6 +126,7 @@ def test_a_report_of_an_older_version(tmp_path: Path) -> None:
     assert len(page.images) == 7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sheet", [b"", b"no jpeg", None])
 def test_without_the_photos_their_outlines_stay(tmp_path: Path, sheet: bytes | None) -> None:
     out = folder_of(tmp_path / "out")
@@ -145,6 +146,7 @@ def test_the_same_run_gives_the_same_bytes(folder: Path, tmp_path: Path) -> None
         assert first.read_bytes() == second.read_bytes()
 
 
+@pytest.mark.slow
 def test_a_stop_leaves_nothing(folder: Path, tmp_path: Path) -> None:
     class StopError(Exception):
         pass
@@ -210,6 +212,7 @@ def test_nothing_known_of_anything(tmp_path: Path) -> None:
     assert "No marker could be left out" in page.said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2])
 def test_hardly_any_points(tmp_path: Path, count: int) -> None:
     few = CloudPoints(**{name: values[:count] for name, values in vars(scene(70, 53)).items()})

@@ -24,6 +24,7 @@ def drawn(_: int = 0) -> Figure:
     return figure
 
 
+@pytest.mark.slow
 def test_threads_draw_the_same_and_leave_nothing() -> None:
     before = dict(matplotlib.rcParams)
     with ThreadPoolExecutor(4) as pool:

@@ -168,6 +168,7 @@ def in_export(targets: dict[str, Any], folder: Path, mode: Mode) -> dict[str, st
 KINDS = {"judging": in_judging, "stage": in_stage, "export": in_export}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_way_leads_out(kind: str, targets: dict[str, Any], tmp_path: Path) -> None:
     found = KINDS[kind](targets, tmp_path / "own", "require")
@@ -179,6 +180,7 @@ def test_no_way_leads_out(kind: str, targets: dict[str, Any], tmp_path: Path) ->
     untouched(targets)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_they_lead_out_where_nothing_is_confined(kind: str, targets: dict[str, Any], tmp_path: Path) -> None:
     found = KINDS[kind](targets, tmp_path / "own", "off")
