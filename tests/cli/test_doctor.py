@@ -125,6 +125,7 @@ def test_one_command_brings_all_missing_modules(bare: pytest.MonkeyPatch) -> Non
     assert "pip install safetensors einops torch;" in missing.do
 
 
+@pytest.mark.slow
 def test_the_default_backends_libraries_answer_soon() -> None:
     started = time.process_time()
     began = time.monotonic()

@@ -94,6 +94,7 @@ def test_what_cannot_be_is_refused_with_advice(tmp_path: Path, arguments: list[s
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_database_that_does_not_answer_is_told(tmp_path: Path) -> None:
     done = keys(tmp_path, "list", database_url="postgresql://nobody@127.0.0.1:1/none")
     assert done.returncode == 2

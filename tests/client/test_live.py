@@ -21,6 +21,7 @@ from tests.support.places import SAMPLES
 # ---- acquisitions -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_acquisition_is_uploaded_and_judged(live: Live, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_tus, "CHUNK", 64 * 1024)
     text = tmp_path / "notes.jpg"

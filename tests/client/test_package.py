@@ -97,6 +97,7 @@ def test_tree_of_errors_is_the_one_that_is_drawn() -> None:
     assert set(drawn) <= set(sc.__all__)
 
 
+@pytest.mark.slow
 def test_import_pulls_no_more_than_httpx_and_numpy_and_is_quick() -> None:
     program = """
 import sys, time, json

@@ -135,6 +135,7 @@ def test_known_signature() -> None:
     assert webhooks.sign("key", b"{}", 1700000000) == f"t=1700000000,v1={digest}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [500, 404, 302])
 def test_refused_delivery_is_repeated_later(
     tables: Database, tmp_path: Path, receiver: Receiver, client: httpx.Client, first: int
@@ -170,6 +171,7 @@ def test_delivery_is_given_up_at_last(tables: Database, tmp_path: Path, client: 
     assert deliver_due(tables, settings(tmp_path, attempts=3), client) == 0
 
 
+@pytest.mark.slow
 def test_two_deliverers_at_once_send_once(tables: Database, tmp_path: Path, receiver: Receiver) -> None:
     ids = {ended_job(tables, receiver.url) for _ in range(12)}
     start = threading.Barrier(4)
@@ -243,6 +245,7 @@ def test_addresses_that_are_allowed(tmp_path: Path, url: str, fits: bool) -> Non
         assert caught.value.details == {"setting": "webhook.url"}
 
 
+@pytest.mark.slow
 def test_host_is_checked_when_the_job_is_made(tmp_path: Path, receiver: Receiver, client: httpx.Client) -> None:
     with serving(tmp_path, webhook_hosts=["127.0.0.1"]) as service:
         api = service.client()

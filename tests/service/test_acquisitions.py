@@ -72,6 +72,7 @@ def test_an_edge_that_no_job_takes_is_refused_and_one_stored_earlier_is_still_re
     assert [one["edge_mm"] for one in client.get("/v1/acquisitions").json()["items"]] == [250.0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -222,6 +223,7 @@ def test_several_files_of_several_roles_in_one_form(service: Running) -> None:
     assert list((service.settings.scratch / "uploads").iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "body",
     [

@@ -71,6 +71,7 @@ headers = st.one_of(
 )
 
 
+@pytest.mark.slow
 @given(header=headers, which=st.booleans())
 @settings(max_examples=120, deadline=None)
 def test_ranges_are_the_files_bytes(

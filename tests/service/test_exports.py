@@ -63,6 +63,7 @@ def queued(service: Running) -> list[tuple[str, str, str, int]]:
 # ---- asking -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_format_is_asked_for_once(service: Running, client: httpx.Client, result: Result) -> None:
     clients = [service.client(["read"]) for _ in range(6)]
     with ThreadPoolExecutor(6) as pool:
@@ -142,6 +143,7 @@ def test_ply_and_meshes(service: Running, client: httpx.Client, result: Result, 
     np.testing.assert_allclose(glb.vertices[glb.faces] * 1000, soup, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_envi(service: Running, client: httpx.Client, result: Result, tmp_path: Path) -> None:
     import spectral.io.envi
 
@@ -158,6 +160,7 @@ def test_envi(service: Running, client: httpx.Client, result: Result, tmp_path: 
     assert np.abs(cube[-1, 0] - mean).max() <= 0.51
 
 
+@pytest.mark.slow
 def test_zarr_opens_as_it_is_with_its_labels(
     service: Running, client: httpx.Client, result: Result, tmp_path: Path
 ) -> None:

@@ -146,6 +146,7 @@ def test_another_worker_takes_over_and_the_first_changes_nothing(
         assert row.executor == "worker-2"
 
 
+@pytest.mark.slow
 def test_a_worker_that_comes_too_late_takes_its_file_back(
     service: Running, client: httpx.Client, result: Result, monkeypatch: pytest.MonkeyPatch
 ) -> None:

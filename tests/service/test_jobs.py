@@ -128,6 +128,7 @@ def test_idempotency_key_belongs_to_one_request_of_one_key(service: Running) -> 
         assert refused.status_code == 422
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "where"),
     [

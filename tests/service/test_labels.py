@@ -232,6 +232,7 @@ def test_what_does_not_fit_is_refused_and_leaves_nothing(
     assert (refused["details"]["point"], refused["details"]["count"]) == (9, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["Tissue", "a b", "a" * 65, "a.b", "%2e%2e", "ä"])
 def test_names_are_safe(service: Running, result: Result, name: str) -> None:
     answer = service.client().put(layer(result, name), content=b"", headers=header())

@@ -274,6 +274,7 @@ def test_cache_drops_what_was_not_used_for_longest() -> None:
     assert cache.kept_bytes == 0
 
 
+@pytest.mark.slow
 def test_one_point(service: Running, tmp_path: Path, client: httpx.Client) -> None:
     points = scene(20, 20)
     alone = type(points)(**{name: values[:1] for name, values in vars(points).items()})

@@ -92,6 +92,7 @@ def test_spectra_are_not_fetched(
     assert [name for name in seen if "spectra" in name] == ["cloud.zarr/spectra/zarr.json"]
 
 
+@pytest.mark.slow
 def test_a_stored_report_that_is_damaged(service: Running, client: httpx.Client, result: Result) -> None:
     service.storage.put(f"{result.prefix}/report.json", b"{}")
     asked = client.post(address(result, "pdf"))

@@ -80,6 +80,7 @@ def test_photo_in_three_pieces_is_judged_at_the_last(service: Running) -> None:
     assert [entry["action"] for entry in audited] == ["file.create"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("headers", "status"),
     [
@@ -249,6 +250,7 @@ def test_names_stay_out_of_paths_and_logs(
     assert "ller" not in json.dumps(client.get("/v1/audit").json())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["scan.h5", "scan.nc", "scan.npz", "scan.mat", "scan.tif"])
 def test_cubes_of_every_format_arrive(service: Running, name: str, tmp_path: Path) -> None:
     """HDF5 asks for a lock, where the upload that is being finished has one."""

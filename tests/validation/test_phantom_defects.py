@@ -29,6 +29,7 @@ def moved() -> Phantom:
     return Phantom(MOVED)
 
 
+@pytest.mark.slow
 def test_photos_and_markers_do_not_know_of_the_motion(still: Phantom, moved: Phantom) -> None:
     for (_, a), (_, b) in zip(still.photos(), moved.photos(), strict=True):
         np.testing.assert_array_equal(a, b)

@@ -200,6 +200,7 @@ def made_up(*rows: Row, has_truth: bool = True) -> Study:
     )
 
 
+@pytest.mark.slow
 def test_the_page_needs_nothing_else(tmp_path: Path) -> None:
     rows = [Row(share=s, seed=k, photos=s // 5, outcome=outcome(0.02 * (1 + k))) for s in (100, 90, 50) for k in (1, 2)]
     study = made_up(*rows, Row(share=25, seed=1, photos=5, outcome=REFUSED))
@@ -220,6 +221,7 @@ def test_the_page_needs_nothing_else(tmp_path: Path) -> None:
     assert {p.name: p.read_bytes() for p in publish_study(study, tmp_path)} == again
 
 
+@pytest.mark.slow
 def test_a_study_without_truth_or_without_a_single_run_is_drawn_too(tmp_path: Path) -> None:
     for name, study in (
         ("a", made_up(Row(share=100, seed=1, photos=20, outcome=outcome(0.02, truth=False)), has_truth=False)),

@@ -54,6 +54,7 @@ def errors_mm(found: Reconstruction, seen: Seen, small: OnDisk) -> list[Floats]:
 # ---- good predictions ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_exact_predictions_come_out_in_the_marker_frame(
     seen: Seen, small: OnDisk, settings: Mast3rSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -50,6 +50,7 @@ def settings(tmp_path: Path) -> Mast3rSettings:
     return scripted_settings(tmp_path, 192)
 
 
+@pytest.mark.slow
 def test_cameras_and_depth_are_the_networks_but_for_frame_and_scale(
     seen: Seen, small: OnDisk, settings: Mast3rSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -34,6 +34,7 @@ def points(cube: FakeCube) -> CloudPoints:
 # ---- order ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @given(st.sets(st.tuples(st.integers(0, 0xFFFF), st.integers(0, 0xFFFF)), max_size=60), st.randoms())
 def test_tile_order_is_a_permutation_in_the_order_of_tiles(chosen: set[tuple[int, int]], random: object) -> None:
     pixels = np.array(list(chosen), np.uint16).reshape(-1, 2)

@@ -45,6 +45,7 @@ def test_ply_reads_back(mesh: Mesh, ply: Path) -> None:
         assert getattr(back, name).dtype == values.dtype
 
 
+@pytest.mark.slow
 def test_stl(mesh: Mesh, ply: Path, tmp_path: Path) -> None:
     path = export_mesh(ply, tmp_path / "m.stl", "stl")
     assert path.stat().st_size == 84 + 50 * len(mesh.triangles)

@@ -116,6 +116,7 @@ def settings(change: dict[str, object]) -> PhantomSettings:
     return replace(SMALL, cube_rows=64, cube_cols=80, bands=2, mesh_divisions=32, **change)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", CUBES)
 def test_truth_is_what_the_camera_sees_and_survives_its_file(tmp_path: Path, change: dict[str, object]) -> None:
     truth = Phantom(settings(change)).truth

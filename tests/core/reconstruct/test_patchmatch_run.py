@@ -56,6 +56,7 @@ def scene(small: OnDisk) -> Scene:
     return Scene(small)
 
 
+@pytest.mark.slow
 def test_maps_lie_on_the_surface_and_false_depth_is_not_trusted(scene: Scene) -> None:
     rng = np.random.default_rng(0)
     noisy = scene.exact * (1 + 0.001 * rng.standard_normal(scene.exact.shape)).astype(np.float32)
@@ -95,6 +96,7 @@ def call(scene: Scene, device: str, **more: object) -> tuple[list[DepthMap], Not
     )
 
 
+@pytest.mark.slow
 def test_without_cuda_a_gpu_is_refused_and_auto_takes_the_cpu(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pycolmap, "has_cuda", False)
     with pytest.raises(BackendUnavailableError, match="without CUDA") as refused:

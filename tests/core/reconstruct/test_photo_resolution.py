@@ -41,6 +41,7 @@ def test_an_edge_that_is_none_has_no_blur() -> None:
     assert np.isnan(blurs).all()
 
 
+@pytest.mark.slow
 def test_sharp_photos_stay_as_they_are() -> None:
     photos = [photo(shown(0.35), name) for name in "ab"]
     found = [detect_markers(p.grey, "DICT_4X4_50") for p in photos]
@@ -73,6 +74,7 @@ def test_one_soft_photo_among_sharp_ones_changes_nothing() -> None:
     assert own_resolution(photos, [detect_markers(p.grey, "DICT_4X4_50") for p in photos]) == 1
 
 
+@pytest.mark.slow
 def test_photos_keep_the_pixels_that_are_asked_of_all() -> None:
     photos = [photo(shown(2.5), name) for name in "ab"]
     found = [detect_markers(p.grey, "DICT_4X4_50", expected=4) for p in photos]
@@ -94,6 +96,7 @@ def test_a_photo_whose_markers_have_no_edge_is_left_out_of_account() -> None:
     assert own_resolution([plain, soft], [found, found]) == own_resolution([soft], [found]) < 0.9
 
 
+@pytest.mark.slow
 def test_the_portrait_of_a_landscape_keeps_square_pixels() -> None:
     turned = [photo(np.ascontiguousarray(np.rot90(shown(0.9)))) for _ in range(2)]
     found = [detect_markers(p.grey, "DICT_4X4_50") for p in turned]

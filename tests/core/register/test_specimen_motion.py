@@ -138,6 +138,7 @@ def test_an_image_brought_to_working_size_keeps_its_place(width: int) -> None:
     assert 1e-5 < np.hypot(*shift.shift_mm) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize(("x", "y", "degrees"), [(1.5, -0.7, 0.0), (-3.0, 4.0, 0.0), (0.4, 0.6, 3.0), (0.0, 0.0, 0.0)])
 def test_direction_and_turn_are_those_of_the_marker_frame(x: float, y: float, degrees: float, mirrored: bool) -> None:
@@ -152,6 +153,7 @@ def test_direction_and_turn_are_those_of_the_marker_frame(x: float, y: float, de
     assert shift.significant == bool(x or y or degrees)
 
 
+@pytest.mark.slow
 def test_nothing_is_said_where_nothing_can_be_told() -> None:
     rng = np.random.default_rng(1)
     caster, image = RayCaster(textured()), seen(textured())

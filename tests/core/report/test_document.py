@@ -40,6 +40,7 @@ def page_of(folder: Path) -> Page:
     return Page(path.read_text(encoding="utf-8"))
 
 
+@pytest.mark.slow
 def test_it_stands_alone(page: Page) -> None:
     assert not {"script", "link", "iframe", "object", "embed", "form"} & page.tags
     assert page.links
@@ -196,6 +197,7 @@ def test_what_is_refused(folder: Path, tmp_path: Path) -> None:
 # ---- odd results --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_nothing_known_of_anything(tmp_path: Path) -> None:
     points = scene(70, 53)
     points = replace(points, sigma_mm=np.full(len(points), np.nan, np.float32), flags=np.zeros_like(points.flags))
