@@ -174,11 +174,17 @@ class BreakingProxy:
             while True:
                 here, _ = self._listening.accept()
                 there = socket.create_connection(self._target)
-                back = threading.Thread(target=self._pump, args=(there, here, None), daemon=True)
-                forth = threading.Thread(target=self._pump, args=(here, there, self), daemon=True)
-                self._threads += [back, forth]
-                back.start()
-                forth.start()
+                self._threads.append(threading.Thread(target=self._pass_on, args=(here, there), daemon=True))
+                self._threads[-1].start()
+
+    def _pass_on(self, here: socket.socket, there: socket.socket) -> None:
+        back = threading.Thread(target=self._pump, args=(there, here, None), daemon=True)
+        back.start()
+        self._pump(here, there, self)
+        back.join()
+        # Closed by one thread while the other reads, its number could be another connection's by then.
+        for end in (here, there):
+            end.close()
 
     def _pump(self, source: socket.socket, target: socket.socket, counted: BreakingProxy | None) -> None:
         passed = 0
@@ -195,7 +201,6 @@ class BreakingProxy:
         for end in (source, target):
             with suppress(OSError):
                 end.shutdown(socket.SHUT_RDWR)
-            end.close()
 
     def close(self) -> None:
         with suppress(OSError):
