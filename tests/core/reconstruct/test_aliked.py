@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -98,6 +99,26 @@ def test_fused_attention_computes_what_the_package_does() -> None:
             assert (own - theirs).abs().max() < 1e-4
         with pytest.raises(ValueError, match="mask"):
             fused(block)(x0, x1, torch.ones(1, 50, 70))
+
+
+@needs_aliked
+@pytest.mark.parametrize("shape", [(192, 192), (150, 203), (97, 64)])
+def test_sparse_maps_give_the_keypoints_and_descriptors_of_the_package(shape: tuple[int, int]) -> None:
+    """Sizes that are and are not multiples of the network's coarsest step, with the image's border in play."""
+    torch = importlib.import_module("torch")
+    module = importlib.import_module("specimap_core.reconstruct.features.aliked")
+    whole = module._package().ALIKED(model_name=module.MODEL, max_num_keypoints=300, detection_threshold=-1).eval()
+    image = cv2.GaussianBlur(np.random.default_rng(1).uniform(0, 1, (*shape, 3)).astype(np.float32), (0, 0), 1.5)
+    tensor = torch.from_numpy((image - image.min()) / np.ptp(image)).permute(2, 0, 1)[None]
+    with torch.inference_mode():
+        theirs = whole({"image": tensor})
+        xy, descriptors = module.SparseAliked(whole)(tensor)
+    # Scores that are equal up to rounding may come in another order.
+    gaps = (theirs["keypoints"][0][:, None] - xy[None]).abs().amax(-1)
+    nearest = gaps.argmin(1)
+    assert len(set(nearest.tolist())) == len(xy) == 300
+    assert gaps.amin(1).max() < 1e-3
+    assert 0 < (theirs["descriptors"][0] - descriptors[nearest]).abs().max() < 1e-3
 
 
 @needs_aliked
