@@ -86,6 +86,10 @@ class Locator:
             self._features[photo, turn] = found
             self._tick()
 
+    def _extract_posed(self, photos: Iterable[int]) -> None:
+        # One that was found turned was described in that turn before it was posed.
+        self._extract(p for p in photos if p not in self._turn)
+
     def _in_its_turn(self, photo: int) -> TurnedPhoto:
         return photo, self._turn.get(photo, 0)
 
@@ -116,7 +120,7 @@ class Locator:
             return
         near = choose_pairs(poses, self._target, DepthSettings(pairs_per_photo=TRIANGULATION_PARTNERS))
         partners = {a: [order[j] for i, j in near if order[i] == a] for a in new}
-        self._extract(p for p in {q for b in partners.values() for q in b} | set(new) if p not in self._turn)
+        self._extract_posed({q for b in partners.values() for q in b} | set(new))
         pairs = []
         for a, others in partners.items():
             self._points[a] = np.full((len(self._features[self._in_its_turn(a)].xy), 3), np.nan)
@@ -148,7 +152,7 @@ class Locator:
 
     def most_similar_first(self, photos: Sequence[int]) -> list[int]:
         """``photos`` by how much they look like the posed photo that looks most like them."""
-        self._triangulate_features(self.poses)
+        self._extract_posed(self.poses)
         self._extract(photos)
         alike: dict[int, int] = {}
         for p in photos:
@@ -162,7 +166,7 @@ class Locator:
         ``turned``: in the other quarter turns, where the kind of features does not see through them.
         """
         others = set(self.poses) - {photo} if among is None else among - {photo}
-        self._triangulate_features(others)
+        self._extract_posed(others)
         if not turned:
             return self._resect(photo, 0, others)
         alike = {}
@@ -186,6 +190,8 @@ class Locator:
         return located
 
     def _pose_from(self, mine: TurnedPhoto, chosen: list[int]) -> ResectedPose | None:
+        # Only what the photo is compared with: a learned matcher takes a quarter of a second for a pair.
+        self._triangulate_features(chosen)
         features = self._features[mine]
         xy, places = [np.zeros((0, 2))], [np.zeros((0, 3))]
         for other, pairs in zip(chosen, self._match([(mine, self._in_its_turn(p)) for p in chosen]), strict=True):
