@@ -93,7 +93,9 @@ def found_project(session: Session, wanted: str) -> Project:
 
 def no_project(wanted: str) -> NotFoundError:
     """Make the error for an unknown project."""
-    return NotFoundError(f"There is no project {wanted}.", advice="GET /v1/projects lists those that you may see.")
+    return NotFoundError(
+        f"There is no project {wanted}.", advice="GET /v1/projects or `specimap projects list` shows what there is."
+    )
 
 
 def new_project(session: Session, name: str) -> Project:
