@@ -20,7 +20,7 @@ from tests.support.result_scene import put_result
 from tests.support.service_scene import Running
 from tests.support.upload_scene import OCTETS, TUS, created, metadata
 
-JUDGEMENT = {
+JUDGEMENT: dict[str, Any] = {
     "kind": "photo",
     "verdict": "accepted",
     "code": None,
