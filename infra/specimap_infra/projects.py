@@ -7,10 +7,11 @@ so that an acquisition and its results are never divided.
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.exc import IntegrityError
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, aliased
 
 from specimap_core.errors import NotFoundError, SettingsError
 from specimap_infra.database import utc_now
@@ -69,13 +70,20 @@ def project_of(session: Session, object_id: str) -> str | None:
 
 def within(table: type[Base], projects: sa.Select[str] | str) -> sa.ColumnElement[bool]:
     """Make the condition that rows of a table belong to a project, or to one of several."""
-    of_acquisition = table not in (Acquisition, ApiKey, AuditEntry, Project)
-    owner = Acquisition if of_acquisition else table
-    column = Project.id if table is Project else owner.project_id  # type: ignore[attr-defined]
-    own: sa.ColumnElement[bool] = column == projects if isinstance(projects, str) else column.in_(projects)
-    if of_acquisition:
-        return table.acquisition_id.in_(sa.select(Acquisition.id).where(own))  # type: ignore[attr-defined,no-any-return]
-    return own
+
+    def is_one(column: Any) -> sa.ColumnElement[bool]:
+        found: sa.ColumnElement[bool] = column == projects if isinstance(projects, str) else column.in_(projects)
+        return found
+
+    if table is Project:
+        return is_one(Project.id)
+    columns: Any = table
+    if table in (Acquisition, ApiKey, AuditEntry):
+        return is_one(columns.project_id)
+    # An alias, since the query may have acquisitions too. Not `in`, which SQLite would begin with: it would then sort
+    # all that a large project has for each page.
+    owner = aliased(Acquisition)
+    return sa.exists().where(owner.id == columns.acquisition_id, is_one(owner.project_id))
 
 
 def named(wanted: str) -> sa.ColumnElement[bool]:

@@ -89,9 +89,11 @@ class Acquisition(Base):
     """An acquisition: the captures of one specimen. Its files, jobs and results belong to its project too."""
 
     __tablename__ = "acquisitions"
+    # In the order of lists, so that a page takes no sorting.
+    __table_args__ = (sa.Index("ix_acquisitions_project_id", "project_id", "id"),)
 
     id: Mapped[str] = mapped_column(primary_key=True)
-    project_id: Mapped[str] = mapped_column(sa.ForeignKey("projects.id"), index=True)
+    project_id: Mapped[str] = mapped_column(sa.ForeignKey("projects.id"))
     specimen_id: Mapped[str] = mapped_column(index=True)
     accession_number: Mapped[str | None] = mapped_column(index=True)
     dictionary: Mapped[str]
@@ -288,11 +290,12 @@ class AuditEntry(Base):
     """An entry of the audit trail: which key did what to which object. It outlives the object."""
 
     __tablename__ = "audit"
+    __table_args__ = (sa.Index("ix_audit_project_id", "project_id", "id"),)
 
     id: Mapped[int] = mapped_column(sa.BigInteger().with_variant(sa.Integer, "sqlite"), primary_key=True)
     at: Mapped[datetime.datetime] = mapped_column(default=utc_now, index=True)
     key_id: Mapped[str]
-    project_id: Mapped[str] = mapped_column(index=True)
+    project_id: Mapped[str]
     """The project of the target."""
     action: Mapped[str]
     target: Mapped[str] = mapped_column(index=True)

@@ -127,7 +127,8 @@ def test_objects_of_another_project_do_not_exist(any_service: Running, tmp_path:
 
 def test_lists_and_filters_show_nothing_of_another_project(any_service: Running, tmp_path: Path) -> None:
     project = any_service.project("theirs")
-    world = make_world(any_service, tmp_path / "result", project, any_service.client(["upload"], project=project))
+    holder = any_service.client(["upload", "read"], project=project)
+    world = make_world(any_service, tmp_path / "result", project, holder)
     stranger = any_service.client(LESSER_SCOPES, project=any_service.project("ours"))
     own = new_acquisition(stranger)
     absent, lists = (
@@ -160,7 +161,11 @@ def test_lists_and_filters_show_nothing_of_another_project(any_service: Running,
                 == {"items": [], "next": None}
             )
     assert stranger.get("/v1/acquisitions", params={"project": "theirs"}).json()["items"] == []
-    assert stranger.get("/v1/acquisitions", params={"specimen_id": "S-1"}).json()["items"] == []
+    for path in ("/v1/acquisitions", "/v1/clouds"):
+        for more in ({}, {"project": "theirs"}, {"project": "ours"}):
+            assert stranger.get(path, params={"specimen_id": "S-1", **more}).json()["items"] == []
+            found = holder.get(path, params={"specimen_id": "S-1", **more}).json()["items"]
+            assert bool(found) == (more != {"project": "ours"}), (path, more)
     for wanted in ("ours", None):
         listed = stranger.get("/v1/acquisitions", params={} if wanted is None else {"project": wanted}).json()["items"]
         assert [item["id"] for item in listed] == [own]
