@@ -16,6 +16,7 @@ from specimap_core.cloud.writer import write_cloud
 from specimap_core.cube import open_cube
 from specimap_infra.database import Database, utc_now
 from specimap_infra.ids import new_id
+from specimap_infra.projects import DEFAULT_PROJECT
 from specimap_infra.storage import Storage
 from specimap_infra.tables import Acquisition, CloudRow, Job
 
@@ -74,6 +75,7 @@ def put_result(served: Served, work: Path) -> Result:
     with database.session() as session:
         session.add(
             Acquisition(
+                project_id=DEFAULT_PROJECT,
                 id=acquisition_id,
                 specimen_id="bench",
                 dictionary="DICT_4X4_50",

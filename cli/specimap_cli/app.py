@@ -15,6 +15,7 @@ from specimap_cli.doctor import doctor
 from specimap_cli.errors import Debug, reported_errors, stoppable
 from specimap_cli.keys import keys_app
 from specimap_cli.progress import Listener, json_listener, progress_listener
+from specimap_cli.projects import projects_app
 from specimap_cli.report import report
 from specimap_cli.validation import study_app, validate
 from specimap_core import __version__
@@ -208,3 +209,4 @@ app.command()(validate)
 app.command()(doctor)
 app.add_typer(study_app, name="study")
 app.add_typer(keys_app, name="keys")
+app.add_typer(projects_app, name="projects")

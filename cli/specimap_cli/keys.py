@@ -4,24 +4,16 @@ from __future__ import annotations
 
 import datetime
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from specimap_cli.errors import REFUSED
-from specimap_core.errors import NotFoundError, SettingsError, SpecimapError
+from specimap_cli.service_database import AUDITED_AS, transaction
+from specimap_core.errors import NotFoundError, SettingsError
 from specimap_core.json_text import json_text
-
-if TYPE_CHECKING:
-    from sqlalchemy.orm import Session
-
-AUDITED_AS = "cli"
-"""Stands for the key in the audit trail: access to the database needs no key."""
 
 keys_app = typer.Typer(no_args_is_help=True, help="Keys to the API: create, list, revoke.")
 
@@ -32,6 +24,7 @@ class Scope(StrEnum):
     upload = "upload"
     read = "read"
     label = "label"
+    intraoperative = "intraoperative"
     admin = "admin"
 
 
@@ -39,14 +32,18 @@ class Scope(StrEnum):
 def create(
     name: Annotated[str, typer.Option(help="Whose key it is; no patient's name.")],
     scope: Annotated[list[Scope], typer.Option(help="What it may do; give it again for more.")],
+    project: Annotated[
+        str, typer.Option(help="Its project, by name or id; it sees no other, unless it is admin.")
+    ] = "",
     expires: Annotated[
         datetime.datetime | None,
         typer.Option(formats=["%Y-%m-%d", "%Y-%m-%dT%H:%M:%S"], help="From when on it is refused, UTC."),
     ] = None,
 ) -> None:
     """Make a key and print it, alone on standard output. It is shown this once and kept nowhere."""
-    with _transaction() as session:
+    with transaction() as session:
         from specimap_infra.database import utc_now
+        from specimap_infra.projects import DEFAULT_PROJECT, found_project
         from specimap_service.auth.keys import new_key
         from specimap_service.context import audit
 
@@ -57,34 +54,39 @@ def create(
             raise SettingsError(
                 f"{expires_at.isoformat()} has passed.", advice="Give a later time to --expires.", setting="expires"
             )
-        row, key = new_key(name, [s.value for s in scope], expires_at=expires_at)
+        owner = found_project(session, project or DEFAULT_PROJECT)
+        row, key = new_key(name, [s.value for s in scope], project_id=owner.id, expires_at=expires_at)
         session.add(row)
         audit(session, AUDITED_AS, "key.create", row.id, scopes=row.scopes)
-    typer.echo(f"Key {row.id} may: {', '.join(row.scopes)}. It is shown this once.", err=True)
+    told = f"Key {row.id} of the project {owner.name} may: {', '.join(row.scopes)}. It is shown this once."
+    typer.echo(told, err=True)
     typer.echo(key)
 
 
 @keys_app.command(name="list")
 def list_keys(as_json: Annotated[bool, typer.Option("--json", help="One JSON line a key.")] = False) -> None:
     """List all keys, revoked ones too, without their secrets."""
-    with _transaction() as session:
+    with transaction() as session:
         import sqlalchemy as sa
 
         from specimap_infra.database import utc_now
-        from specimap_infra.tables import ApiKey
+        from specimap_infra.tables import ApiKey, Project
 
         rows, now = list(session.scalars(sa.select(ApiKey).order_by(ApiKey.id))), utc_now()
-    table = Table("id", "name", "scopes", "created", "last used", "state", box=None)
+        projects = {row.id: row.name for row in session.scalars(sa.select(Project))}
+    table = Table("id", "name", "project", "scopes", "created", "last used", "state", box=None)
     for row in rows:
         state = "revoked" if row.revoked_at else "expired" if row.expires_at and row.expires_at <= now else "valid"
         if as_json:
             times = {name: getattr(row, name) for name in ("created_at", "last_used_at", "expires_at", "revoked_at")}
             dates = {name: value.isoformat() if value else None for name, value in times.items()}
-            line = {"id": row.id, "name": row.name, "scopes": row.scopes, "state": state, **dates}
+            named = {"id": row.id, "name": row.name, "project_id": row.project_id, "project": projects[row.project_id]}
+            line = {**named, "scopes": row.scopes, "state": state, **dates}
             sys.stdout.write(json_text(line) + "\n")
             continue
         used = row.last_used_at.isoformat(" ", "minutes") if row.last_used_at else "never"
-        table.add_row(row.id, row.name, " ".join(row.scopes), row.created_at.isoformat(" ", "minutes"), used, state)
+        created = row.created_at.isoformat(" ", "minutes")
+        table.add_row(row.id, row.name, projects[row.project_id], " ".join(row.scopes), created, used, state)
     if not as_json:
         # Output to a file or a pipe is not cut at a terminal's width.
         console = Console(markup=False)
@@ -94,7 +96,7 @@ def list_keys(as_json: Annotated[bool, typer.Option("--json", help="One JSON lin
 @keys_app.command()
 def revoke(key_id: Annotated[str, typer.Argument(help="Its id, key_…, as `specimap keys list` shows it.")]) -> None:
     """Revoke a key; it is refused within two seconds everywhere."""
-    with _transaction() as session:
+    with transaction() as session:
         from specimap_infra.database import utc_now
         from specimap_infra.tables import ApiKey
         from specimap_service.context import audit
@@ -106,28 +108,3 @@ def revoke(key_id: Annotated[str, typer.Argument(help="Its id, key_…, as `spec
             row.revoked_at = utc_now()
             audit(session, AUDITED_AS, "key.revoke", key_id)
     typer.echo(f"Revoked {key_id}.", err=True)
-
-
-@contextmanager
-def _transaction() -> Iterator[Session]:
-    """Open a transaction on the database that the settings name; report an error with its advice, and exit with 2."""
-    try:
-        # Imported late: `specimap --help` and `specimap run` need none of the service's libraries.
-        from specimap_infra.database import Database
-        from specimap_infra.migrate import migrate
-        from specimap_infra.settings import load_settings
-
-        database = Database.open(load_settings().database)
-        try:
-            # The first key comes before the first start of the service.
-            migrate(database)
-            with database.session() as session:
-                yield session
-        finally:
-            database.close()
-    except ModuleNotFoundError as error:
-        typer.echo(f"{error.name} is not installed. Install specimap[service].", err=True)
-        raise typer.Exit(REFUSED) from None
-    except SpecimapError as error:
-        typer.echo(f"{error.code}: {error}", err=True)
-        raise typer.Exit(REFUSED) from None

@@ -16,6 +16,7 @@ from specimap_infra.confinement import check_confinement
 from specimap_infra.database import Database
 from specimap_infra.logs import set_up_logs
 from specimap_infra.migrate import exclusive_lock, migrate
+from specimap_infra.projects import DEFAULT_PROJECT
 from specimap_infra.settings import ServiceSettings, load_settings
 from specimap_infra.storage import Storage
 from specimap_infra.tables import SCOPES, ApiKey
@@ -143,6 +144,6 @@ def _first_key(database: Database) -> str | None:
     with exclusive_lock(database.engine), database.session() as session:
         if session.scalar(sa.select(sa.func.count()).select_from(ApiKey)):
             return None
-        row, key = new_key("administrator", SCOPES)
+        row, key = new_key("administrator", SCOPES, project_id=DEFAULT_PROJECT)
         session.add(row)
     return key

@@ -13,6 +13,7 @@ from alembic.config import Config
 from dbos import DBOS
 
 from specimap_infra.database import Database, database_errors
+from specimap_infra.tables import Base
 
 LOCK = 7261534
 """Number of the PostgreSQL advisory lock; any number that nothing else in the database uses."""
@@ -35,8 +36,33 @@ def migrate(database: Database) -> None:
     with database_errors(), exclusive_lock(database.engine):
         # The engine's own function, since its client never migrates.
         DBOS.migrate(database.engine.url.render_as_string(hide_password=False))
-        with database.engine.begin() as connection:
+        with database.engine.connect() as connection, whole(connection):
             command.upgrade(alembic_config(connection), "head")
+
+
+@contextmanager
+def whole(connection: sa.Connection) -> Iterator[None]:
+    """Make a transaction of a migration: all of it or none."""
+    if connection.dialect.name != "sqlite":
+        with connection.begin():
+            yield
+        return
+    # SQLite changes a table by dropping it for a changed copy. With foreign keys, the drop would delete the
+    # rows of other tables that refer to it. The switch works outside of a transaction only.
+    connection.exec_driver_sql("PRAGMA foreign_keys=OFF")
+    try:
+        # Without this, the driver would begin a transaction at the first write of rows, after tables were changed.
+        connection.exec_driver_sql("BEGIN IMMEDIATE")
+        yield
+        for table in Base.metadata.tables.keys() & set(sa.inspect(connection).get_table_names()):
+            if connection.exec_driver_sql(f"PRAGMA foreign_key_check({table})").first():
+                raise RuntimeError(f"the migration breaks references of the table {table}")
+        connection.commit()
+    except BaseException:
+        connection.rollback()
+        raise
+    finally:
+        connection.exec_driver_sql("PRAGMA foreign_keys=ON")
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from specimap_infra.database import utc_now
 JOB_STATES = ("queued", "running", "succeeded", "failed", "cancelled")
 FINAL_STATES = ("succeeded", "failed", "cancelled")
 PRIORITIES = {"intraoperative": 1, "routine": 5, "research": 9}
-SCOPES = ("upload", "read", "label", "admin")
+SCOPES = ("upload", "read", "label", "intraoperative", "admin")
 ROLES = ("photo", "cube", "white", "dark")
 
 
@@ -55,12 +55,25 @@ def _owned_by(table: str, **options: Any) -> Any:
     return mapped_column(sa.ForeignKey(f"{table}.id", ondelete="CASCADE"), index=True, **options)
 
 
+class Project(Base):
+    """A group of keys that share their objects; other keys do not see them."""
+
+    __tablename__ = "projects"
+    __table_args__ = (sa.UniqueConstraint("name"),)
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    name: Mapped[str]
+    created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now)
+
+
 class ApiKey(Base):
     """A key; only the hash of its secret is kept."""
 
     __tablename__ = "api_keys"
 
     id: Mapped[str] = mapped_column(primary_key=True)
+    project_id: Mapped[str] = mapped_column(sa.ForeignKey("projects.id"), index=True)
+    """The key's project for good: what it made would otherwise change hands with it."""
     name: Mapped[str]
     secret_hash: Mapped[str]
     scopes: Mapped[list[str]]
@@ -73,11 +86,14 @@ class ApiKey(Base):
 
 
 class Acquisition(Base):
-    """An acquisition: the captures of one specimen."""
+    """An acquisition: the captures of one specimen. Its files, jobs and results belong to its project too."""
 
     __tablename__ = "acquisitions"
+    # In the order of lists, so that a page takes no sorting.
+    __table_args__ = (sa.Index("ix_acquisitions_project_id", "project_id", "id"),)
 
     id: Mapped[str] = mapped_column(primary_key=True)
+    project_id: Mapped[str] = mapped_column(sa.ForeignKey("projects.id"))
     specimen_id: Mapped[str] = mapped_column(index=True)
     accession_number: Mapped[str | None] = mapped_column(index=True)
     dictionary: Mapped[str]
@@ -274,10 +290,13 @@ class AuditEntry(Base):
     """An entry of the audit trail: which key did what to which object. It outlives the object."""
 
     __tablename__ = "audit"
+    __table_args__ = (sa.Index("ix_audit_project_id", "project_id", "id"),)
 
     id: Mapped[int] = mapped_column(sa.BigInteger().with_variant(sa.Integer, "sqlite"), primary_key=True)
     at: Mapped[datetime.datetime] = mapped_column(default=utc_now, index=True)
     key_id: Mapped[str]
+    project_id: Mapped[str]
+    """The project of the target."""
     action: Mapped[str]
     target: Mapped[str] = mapped_column(index=True)
     details: Mapped[dict[str, Any]]

@@ -16,6 +16,7 @@ from specimap_service.acquisitions import dependencies as acquisitions
 from specimap_service.acquisitions import file_routes
 from specimap_service.acquisitions import routes as acquisition_routes
 from specimap_service.auth import dependencies as auth
+from specimap_service.auth import project_routes
 from specimap_service.auth import routes as key_routes
 from specimap_service.body_limits import BodyLimits
 from specimap_service.clouds import dependencies as clouds
@@ -40,6 +41,7 @@ FEATURES = (auth.FEATURE, acquisitions.FEATURE, uploads.FEATURE, jobs.FEATURE, c
 """Opened in this order, closed in the reverse one: uploads use the judge of acquisitions."""
 ROUTES = (
     health,
+    project_routes,
     key_routes,
     acquisition_routes,
     form_routes,

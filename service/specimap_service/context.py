@@ -11,6 +11,7 @@ from fastapi import Depends
 from sqlalchemy.orm import Session
 
 from specimap_infra.database import Database
+from specimap_infra.projects import project_of
 from specimap_infra.queue import queue_client
 from specimap_infra.settings import ServiceSettings
 from specimap_infra.storage import Storage
@@ -56,10 +57,20 @@ def correlation_id() -> str:
 
 
 def audit(session: Session, key_id: str, action: str, target: str, **details: object) -> None:
-    """Add an entry to the audit trail within the transaction that it records.
+    """Add an entry to the audit trail within the transaction that it records: before the target is deleted.
 
     ``details`` hold ids and numbers, no names.
     """
+    project = project_of(session, target)
+    if project is None:
+        raise LookupError(f"{target} is not there to be written about")
     session.add(
-        AuditEntry(key_id=key_id, action=action, target=target, details=details, correlation_id=correlation_id())
+        AuditEntry(
+            key_id=key_id,
+            project_id=project,
+            action=action,
+            target=target,
+            details=details,
+            correlation_id=correlation_id(),
+        )
     )

@@ -26,6 +26,15 @@ Moment = Annotated[AwareDatetime, AfterValidator(_year_in_range)]
 """A time with its zone, far enough from the calendar's ends to have a UTC time."""
 
 
+InProject = Annotated[
+    str | None,
+    Query(
+        pattern=r"^[A-Za-z0-9._-]{1,64}$",
+        description="Only those of this project, by its id or name; without it, of all that the key sees.",
+    ),
+]
+
+
 class Page(BaseModel, Generic[Item]):
     """One page."""
 

@@ -14,13 +14,15 @@ import pytest
 
 from tests.support.service_scene import serving
 
-PROGRAM = "from specimap_cli.keys import keys_app; keys_app()"
+PROGRAM = "from specimap_cli.{0} import {0}_app; {0}_app()"
 
 
-def keys(folder: Path, *arguments: str, database_url: str = "") -> subprocess.CompletedProcess[str]:
+def keys(
+    folder: Path, *arguments: str, database_url: str = "", program: str = "keys"
+) -> subprocess.CompletedProcess[str]:
     environment = {name: value for name, value in os.environ.items() if not name.startswith("SPECIMAP_")}
     environment |= {"SPECIMAP_DATA_DIR": str(folder), "SPECIMAP_DATABASE_URL": database_url}
-    command = [sys.executable, "-W", "error", "-c", PROGRAM, *arguments]
+    command = [sys.executable, "-W", "error", "-c", PROGRAM.format(program), *arguments]
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
 
 
@@ -60,6 +62,44 @@ def test_key_is_made_before_the_first_start_and_opens_the_service(tmp_path: Path
         audited = service.client().get("/v1/audit", params={"target": row["id"]}).json()["items"]
         assert [(e["action"], e["key_id"]) for e in audited] == [("key.revoke", "cli"), ("key.create", "cli")]
     assert listed(tmp_path, any_database)[0]["state"] == "revoked"
+
+
+@pytest.mark.slow
+def test_projects_are_made_and_keys_are_made_for_them(tmp_path: Path) -> None:
+    def projects(*arguments: str) -> subprocess.CompletedProcess[str]:
+        return keys(tmp_path, *arguments, program="projects")
+
+    made = projects("create", "study-7")
+    assert made.returncode == 0, made.stderr
+    project = made.stdout.strip()
+    taken = projects("create", "study-7")
+    assert (taken.returncode, taken.stdout) == (2, "")
+    assert taken.stderr.startswith("state_conflict: ")
+    assert projects("rename", "study-7", "Anna Muster").stderr.startswith("setting_invalid: ")
+    assert projects("rename", "study-7", "study-8").returncode == 0
+    rows = [json.loads(line) for line in projects("list", "--json").stdout.splitlines()]
+    assert [row["name"] for row in rows] == ["default", "study-8"]
+    assert rows[1]["id"] == project
+    assert f"{project}  study-8" in projects("list").stdout
+    for wanted in ("study-8", project):
+        done = keys(tmp_path, "create", "--name", "a", "--scope", "upload", "--project", wanted)
+        assert done.returncode == 0, done.stderr
+        assert "study-8" in done.stderr
+    unknown = keys(tmp_path, "create", "--name", "a", "--scope", "read", "--project", "study-7")
+    assert (unknown.returncode, unknown.stdout) == (2, "")
+    assert unknown.stderr.startswith("not_found: ")
+    keys(tmp_path, "create", "--name", "b", "--scope", "intraoperative")
+    assert [(row["project"], row["scopes"]) for row in listed(tmp_path)] == [
+        ("study-8", ["upload"]),
+        ("study-8", ["upload"]),
+        ("default", ["intraoperative"]),
+    ]
+    with serving(tmp_path) as service:
+        administrator = service.client()
+        audited = administrator.get("/v1/audit", params={"project": project}).json()["items"]
+        assert {entry["key_id"] for entry in audited} == {"cli"}
+        actions = [entry["action"] for entry in audited]
+        assert actions == ["key.create", "key.create", "project.rename", "project.create"]
 
 
 @pytest.mark.slow

@@ -178,6 +178,31 @@ def test_keys_are_made_listed_and_revoked(live: Live) -> None:
             reader.clouds.get(live.result.cloud_id)
 
 
+def test_projects_keep_apart_what_their_keys_make(live: Live) -> None:
+    administrator = live.client
+    project = administrator.projects.rename(administrator.projects.create("study-7"), "study-8")
+    assert administrator.projects.get(project) == project
+    assert [p.name for p in administrator.projects.list()] == ["default", "study-8"]
+    with pytest.raises(sc.Conflict):
+        administrator.projects.create("study-8")
+    made = administrator.keys.create("tablet 4", ["upload", "read"], project=project)
+    assert made.project_id == project.id
+    assert [key.id for key in administrator.keys.list(project="study-8")] == [made.id]
+    with sc.Client(live.service.url, made.key, transport=httpx.HTTPTransport()) as other:
+        assert other.projects.list() == [project]
+        with pytest.raises(sc.NotFound):
+            other.clouds.get(live.result.cloud_id)
+        assert not [*other.clouds.list(), *other.jobs.list(), *other.acquisitions.list()]
+        own = other.acquisitions.create("SP-8")
+        assert own.project_id == project.id
+        with pytest.raises(sc.Forbidden) as caught:
+            other.jobs.submit(acquisition(live.service.database, project=project.id), priority="intraoperative")
+        assert caught.value.details == {"scope": "intraoperative"}
+    assert own.id in [a.id for a in administrator.acquisitions.list(project=project)]
+    assert not [*administrator.clouds.list(project=project), *administrator.jobs.list(project="study-8")]
+    assert live.result.cloud_id in [cloud.id for cloud in administrator.clouds.list(project="default")]
+
+
 def test_rate_limit_is_waited_for(live: Live) -> None:
     key = live.service.key(["read"], rate_per_minute=60)
     started = time.monotonic()

@@ -47,6 +47,7 @@ def test_public_names() -> None:
         "NotFound",
         "Point",
         "Progress",
+        "Project",
         "RateLimited",
         "Refused",
         "Report",

@@ -65,6 +65,14 @@ def keys(reader: Reader) -> None:
     assert httpx.get(f"{reader.service.url}/v1/jobs", headers=bearer, trust_env=False).status_code == 401
 
 
+def projects(reader: Reader) -> None:
+    project, key, listed = documents(reader.sh("Projects"))
+    assert (project["name"], key["project_id"], listed["items"]) == ("study-7", project["id"], [])
+    reader.variables["PROJECT"] = project["id"]
+    (renamed,) = documents(reader.sh("Projects"))
+    assert renamed == {**project, "name": "study-8"}
+
+
 def errors(reader: Reader) -> None:
     (answer,) = documents(reader.sh("Errors", status=22))
     shown = json.loads(reader.next("Errors", "json"))
@@ -261,7 +269,7 @@ def lists_and_ranges(reader: Reader) -> None:
 
 @pytest.mark.slow
 def test_everything_on_the_page_does_what_it_says(reader: Reader) -> None:
-    for part in (keys, errors, uploads, jobs_and_events, webhook, results, labels, lists_and_ranges):
+    for part in (keys, projects, errors, uploads, jobs_and_events, webhook, results, labels, lists_and_ranges):
         part(reader)
     assert {title: rest for title, rest in reader.left.items() if rest} == {}
 

@@ -26,6 +26,7 @@ OF_PATHS = {
     "job_id": f"job_{'0' * 26}",
     "cloud_id": f"cloud_{'0' * 26}",
     "key_id": f"key_{'0' * 26}",
+    "project_id": f"prj_{'0' * 26}",
     "upload_id": f"up_{'0' * 26}",
     "uuid": f"up_{'0' * 26}",
     "name": "layer",

@@ -57,8 +57,9 @@ def test_every_operation_but_health_wants_a_key(contract: dict[str, Any], servic
             if path in ("/healthz", "/readyz"):
                 continue
             assert operation["security"], f"{method} {path}"
-            for name in ("key", "acquisition", "file", "job", "cloud"):
-                path = path.replace(f"{{{name}_id}}", f"{name if name != 'acquisition' else 'acq'}_{'0' * 26}")
+            for name in ("key", "acquisition", "file", "job", "cloud", "project"):
+                kind = {"acquisition": "acq", "project": "prj"}.get(name, name)
+                path = path.replace(f"{{{name}_id}}", f"{kind}_{'0' * 26}")
             for name, value in {"upload_id": f"up_{'0' * 26}", "uuid": f"up_{'0' * 26}"}.items():
                 path = path.replace(f"{{{name}}}", value)
             for name, value in {"key": "zarr.json", "name": "a", "format": "ply", "index": "0", "band": "0"}.items():

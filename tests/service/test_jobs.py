@@ -34,7 +34,7 @@ def workflows(service: Running, **filters: Any) -> dict[str, str]:
 
 def test_job_is_queued_with_its_workflow_and_first_event(any_service: Running) -> None:
     owner = acquisition(any_service.database, edge_mm=7.5)
-    client = any_service.client(("upload", "read"))
+    client = any_service.client(("upload", "read", "intraoperative"))
     wanted = {"acquisition_id": owner, "settings": {"r_pc": 0.25}, "priority": "intraoperative"}
     answer = client.post("/v1/jobs", json=wanted, headers={"X-Correlation-Id": "theatre-2.0001"})
     assert answer.status_code == 202

@@ -11,19 +11,28 @@ from specimap_infra.database import Database
 from specimap_infra.ids import new_id
 from specimap_infra.job_schemas import JobSettings
 from specimap_infra.jobs import append_event
+from specimap_infra.projects import DEFAULT_PROJECT
 from specimap_infra.tables import Acquisition, Job, JobEvent, StoredFile
 
 CUBE = ("cube.hdr", "cube.raw")
 EXECUTOR = "host:0:one"
 
 
-def acquisition(database: Database, *, photos: int = 6, others: Sequence[str] = CUBE, edge_mm: float = 6.8) -> str:
+def acquisition(
+    database: Database,
+    *,
+    photos: int = 6,
+    others: Sequence[str] = CUBE,
+    edge_mm: float = 6.8,
+    project: str = DEFAULT_PROJECT,
+) -> str:
     """An acquisition with rows of accepted files, without the files."""
     acquisition_id = new_id("acq")
     labels = [f"photo-{n:04d}.jpg" for n in range(1, photos + 1)] + list(others)
     with database.session() as session:
         session.add(
             Acquisition(
+                project_id=project,
                 id=acquisition_id,
                 specimen_id="S-1",
                 accession_number=None,

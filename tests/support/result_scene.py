@@ -30,6 +30,7 @@ from specimap_core.surface.fusion import Mesh
 from specimap_core.surface.mesh_files import write_mesh_ply
 from specimap_infra.database import utc_now
 from specimap_infra.ids import new_id
+from specimap_infra.projects import DEFAULT_PROJECT
 from specimap_infra.tables import Acquisition, CloudRow, Job, LabelVersion
 from tests.support.cloud_scene import FakeCube, counts, scene
 from tests.support.service_scene import Running
@@ -96,6 +97,7 @@ def put_result(
         if new_acquisition:
             session.add(
                 Acquisition(
+                    project_id=DEFAULT_PROJECT,
                     id=acquisition,
                     specimen_id=specimen_id,
                     accession_number=accession_number,

@@ -22,6 +22,7 @@ from fastapi import FastAPI
 
 from specimap_infra.database import Database
 from specimap_infra.logs import SHARED
+from specimap_infra.projects import DEFAULT_PROJECT, new_project
 from specimap_infra.settings import ServiceSettings, load_settings
 from specimap_infra.storage import Storage
 from specimap_service.acquisitions import dependencies
@@ -31,7 +32,7 @@ from specimap_service.auth.keys import new_key
 from specimap_service.connections import Connection
 from tests.support.databases import create_tables
 
-ALL_SCOPES = ("upload", "read", "label", "admin")
+ALL_SCOPES = ("upload", "read", "label", "intraoperative", "admin")
 
 
 @dataclass
@@ -55,16 +56,23 @@ class Running:
         storage: Storage = self.app.state.context.storage
         return storage
 
-    def key(self, scopes: Sequence[str] = ALL_SCOPES, **options: int) -> str:
+    def key(self, scopes: Sequence[str] = ALL_SCOPES, *, project: str = DEFAULT_PROJECT, **options: int) -> str:
         """A new key."""
-        row, key = new_key("test", scopes, **options)  # type: ignore[arg-type]
+        row, key = new_key("test", scopes, project_id=project, **options)  # type: ignore[arg-type]
         with self.database.session() as session:
             session.add(row)
         return key
 
-    def client(self, scopes: Sequence[str] = ALL_SCOPES, **options: int) -> httpx.Client:
+    def project(self, name: str) -> str:
+        """A new project's id."""
+        with self.database.session() as session:
+            return new_project(session, name).id
+
+    def client(
+        self, scopes: Sequence[str] = ALL_SCOPES, *, project: str = DEFAULT_PROJECT, **options: int
+    ) -> httpx.Client:
         """A client with a new key of these scopes; closed with the service."""
-        headers = {"Authorization": f"Bearer {self.key(scopes, **options)}"}
+        headers = {"Authorization": f"Bearer {self.key(scopes, project=project, **options)}"}
         client = httpx.Client(base_url=self.url, headers=headers, timeout=60, trust_env=False)
         self.clients.append(client)
         return client

@@ -18,6 +18,7 @@ from typing import Any
 import httpx
 
 from specimap_infra.database import Database
+from specimap_infra.projects import DEFAULT_PROJECT
 from specimap_infra.settings import load_settings
 from specimap_service.auth.keys import new_key
 from tests.support.databases import create_tables
@@ -30,6 +31,7 @@ SERVER = """
 import json, resource, socket, sys
 import uvicorn
 from specimap_infra.logs import set_up_logs
+from specimap_infra.projects import DEFAULT_PROJECT
 from specimap_infra.settings import load_settings
 from specimap_service.app import create_app
 
@@ -139,7 +141,7 @@ def key_in(folder: Path) -> str:
     """A key with all scopes, in the database of a folder that no server serves yet."""
     database = Database.open(load_settings(data_dir=folder).database)
     create_tables(database)
-    row, key = new_key("test", ("upload", "read", "admin"))
+    row, key = new_key("test", ("upload", "read", "admin"), project_id=DEFAULT_PROJECT)
     with database.session() as session:
         session.add(row)
     database.close()

@@ -21,6 +21,7 @@ import sqlalchemy as sa
 from specimap_infra import jobs
 from specimap_infra.database import Database
 from specimap_infra.ids import new_id
+from specimap_infra.projects import DEFAULT_PROJECT
 from specimap_infra.queue import JOBS, RUN_JOB, enqueue, queue_client
 from specimap_infra.settings import ServiceSettings, load_settings
 from specimap_infra.storage import Storage
@@ -61,7 +62,13 @@ class Shop:
     def acquisition(self, photos: Path, header: Path) -> str:
         """Store photos and an ENVI cube as the API does; gives the acquisition's id."""
         row = Acquisition(
-            id=new_id("acq"), specimen_id="S1", dictionary="DICT_4X4_50", edge_mm=6.8, notes="", created_by="key_test"
+            project_id=DEFAULT_PROJECT,
+            id=new_id("acq"),
+            specimen_id="S1",
+            dictionary="DICT_4X4_50",
+            edge_mm=6.8,
+            notes="",
+            created_by="key_test",
         )
         with self.database.session() as session:
             session.add(row)

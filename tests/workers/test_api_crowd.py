@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from specimap_client import Client, Retries
+from specimap_infra.projects import DEFAULT_PROJECT
 from specimap_service.auth.keys import new_key
 from tests.support.scenes import Finished, OnDisk
 from tests.support.worker_scene import QUICK, Shop, assert_all_succeed, shop
@@ -52,7 +53,7 @@ def test_no_job_is_lost_when_api_and_workers_are_killed_at_random(
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    row, key = new_key("test", ["upload", "read"], rate_per_minute=1_000_000)
+    row, key = new_key("test", ["upload", "read"], project_id=DEFAULT_PROJECT, rate_per_minute=1_000_000)
     options = {"RESULT_FOLDER": str(finished.out), "STAGE_SECONDS": "0.01"}
     with shop(tmp_path / "shop") as yard, api(yard, port) as restart:
         with yard.database.session() as session:

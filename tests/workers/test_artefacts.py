@@ -13,6 +13,7 @@ from specimap_core.pipeline.artefacts import Store
 from specimap_infra import jobs
 from specimap_infra.database import Database
 from specimap_infra.ids import new_id
+from specimap_infra.projects import DEFAULT_PROJECT
 from specimap_infra.settings import load_settings
 from specimap_infra.storage import Storage
 from specimap_infra.tables import Acquisition, Artefact, Job
@@ -58,7 +59,13 @@ def test_of_jobs_that_finish_a_stage_at_once_one_artefact_stays(tables: Database
     with tables.session() as session:
         session.add(
             Acquisition(
-                id=acquisition, specimen_id="S1", dictionary="DICT_4X4_50", edge_mm=6.8, notes="", created_by="key_test"
+                project_id=DEFAULT_PROJECT,
+                id=acquisition,
+                specimen_id="S1",
+                dictionary="DICT_4X4_50",
+                edge_mm=6.8,
+                notes="",
+                created_by="key_test",
             )
         )
     storage = Together.open(load_settings(data_dir=tmp_path / "data"))

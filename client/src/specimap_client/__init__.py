@@ -49,6 +49,7 @@ from specimap_client._models import (
     NewKey,
     Point,
     Progress,
+    Project,
 )
 from specimap_client._report import Report
 from specimap_client._retries import Retries
@@ -80,6 +81,7 @@ __all__ = [
     "NotFound",
     "Point",
     "Progress",
+    "Project",
     "RateLimited",
     "Refused",
     "Report",

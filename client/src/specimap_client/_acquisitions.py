@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from specimap_client._errors import UnexpectedAnswer
 from specimap_client._http import Session, path
-from specimap_client._models import Acquisition, File, id_of
+from specimap_client._models import Acquisition, File, Project, id_of
 from specimap_client._uploads import AnyPath, Listener, upload
 
 
@@ -48,9 +48,14 @@ class Acquisitions:
         accession_number: str | None = None,
         created_after: datetime.datetime | None = None,
         created_before: datetime.datetime | None = None,
+        project: Project | str | None = None,
     ) -> Iterator[Acquisition]:
-        """Acquisitions, newest first, page by page as they are reached. Times are aware."""
-        filters = {"specimen_id": specimen_id, "accession_number": accession_number}
+        """Acquisitions, newest first, page by page as they are reached. Times are aware.
+
+        ``project``: of what the key sees, only this one's; a text is its id or name.
+        """
+        owner = None if project is None else id_of(project)
+        filters = {"specimen_id": specimen_id, "accession_number": accession_number, "project": owner}
         times = {
             name: time.astimezone(datetime.UTC).isoformat() if time else None
             for name, time in (("created_after", created_after), ("created_before", created_before))

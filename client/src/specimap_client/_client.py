@@ -15,6 +15,7 @@ from specimap_client._errors import NotConfigured
 from specimap_client._http import Session
 from specimap_client._jobs import Jobs
 from specimap_client._keys import Keys
+from specimap_client._projects import Projects
 from specimap_client._retries import Retries
 
 URL_VARIABLE, KEY_VARIABLE = "SPECIMAP_URL", "SPECIMAP_KEY"
@@ -61,6 +62,7 @@ class Client:
         self.jobs = Jobs(self._session)
         self.clouds = Clouds(self._session)
         self.keys = Keys(self._session)
+        self.projects = Projects(self._session)
 
     @property
     def url(self) -> str:

@@ -19,7 +19,7 @@ from specimap_client._downloads import fetch_zarr
 from specimap_client._errors import MissingExtra
 from specimap_client._http import Session, path
 from specimap_client._labels import ClassLike, Label
-from specimap_client._models import Acquisition, Export, Point, Progress, id_of
+from specimap_client._models import Acquisition, Export, Point, Progress, Project, id_of
 from specimap_client._spectra import Selection, Spectra, query
 
 if TYPE_CHECKING:
@@ -279,8 +279,17 @@ class Clouds:
         """A cloud by its id, which a succeeded job has as ``cloud_id``."""
         return Cloud(self._session, self._session.json("GET", path("clouds", cloud)))
 
-    def list(self, *, acquisition: Acquisition | str | None = None, specimen_id: str | None = None) -> Iterator[Cloud]:
-        """Clouds, newest first, page by page as they are reached."""
-        acquisition_id = None if acquisition is None else id_of(acquisition)
-        for item in self._session.pages(path("clouds"), acquisition_id=acquisition_id, specimen_id=specimen_id):
+    def list(
+        self,
+        *,
+        acquisition: Acquisition | str | None = None,
+        specimen_id: str | None = None,
+        project: Project | str | None = None,
+    ) -> Iterator[Cloud]:
+        """Clouds, newest first, page by page as they are reached. ``project``: as for acquisitions."""
+        filters = {
+            "acquisition_id": None if acquisition is None else id_of(acquisition),
+            "project": None if project is None else id_of(project),
+        }
+        for item in self._session.pages(path("clouds"), specimen_id=specimen_id, **filters):
             yield Cloud(self._session, item)

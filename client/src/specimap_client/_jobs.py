@@ -11,7 +11,7 @@ from specimap_client import _retries
 from specimap_client._errors import ConnectionFailed, JobFailed, ServerError, Timeout, UnexpectedAnswer
 from specimap_client._events import HeldBackError, job_events
 from specimap_client._http import Session, path
-from specimap_client._models import Acquisition, Event, Job, LogLine, id_of
+from specimap_client._models import Acquisition, Event, Job, LogLine, Project, id_of
 from specimap_client._report import Report
 
 Priority = Literal["intraoperative", "routine", "research"]
@@ -43,6 +43,7 @@ class Jobs:
         Raises:
             Conflict: ``upload_incomplete``, ``details['missing']`` says what; ``idempotency_conflict``.
             Refused: a setting is wrong.
+            Forbidden: for the priority ``intraoperative``, the key needs that scope.
         """
         body: dict[str, Any] = {"acquisition_id": id_of(acquisition), "priority": priority}
         if settings:
@@ -57,10 +58,16 @@ class Jobs:
         return Job.of(self._session.json("GET", path("jobs", id_of(job))))
 
     def list(
-        self, *, acquisition: Acquisition | str | None = None, state: str | None = None, **filters: Any
+        self,
+        *,
+        acquisition: Acquisition | str | None = None,
+        state: str | None = None,
+        project: Project | str | None = None,
+        **filters: Any,
     ) -> Iterator[Job]:
-        """Jobs, newest first, page by page as they are reached."""
+        """Jobs, newest first, page by page as they are reached. ``project``: as for acquisitions."""
         acquisition_id = None if acquisition is None else id_of(acquisition)
+        filters["project"] = None if project is None else id_of(project)
         for item in self._session.pages(path("jobs"), acquisition_id=acquisition_id, state=state, **filters):
             yield Job.of(item)
 

@@ -49,6 +49,7 @@ class Acquisition(Model):
     files: AcquisitionFiles
     ready: bool
     missing: tuple[str, ...]
+    project_id: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,10 +154,20 @@ class Export(Model):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Project(Model):
+    """A group of keys that share their acquisitions and results."""
+
+    id: str
+    name: str
+    created_at: datetime.datetime
+
+
+@dataclass(frozen=True, kw_only=True)
 class Key(Model):
     """A key, without its secret."""
 
     id: str
+    project_id: str | None = None
     name: str
     scopes: tuple[str, ...]
     created_at: datetime.datetime

@@ -8,9 +8,10 @@ import sqlalchemy as sa
 from sqlalchemy.orm import Session
 
 from specimap_core.atomic import disk_errors
-from specimap_core.errors import NotFoundError, StorageFullError
+from specimap_core.errors import StorageFullError
 from specimap_infra.settings import ServiceSettings
 from specimap_infra.tables import Acquisition, ApiKey, StoredFile, Upload
+from specimap_service.auth.access import not_found
 from specimap_service.auth.keys import Principal
 from specimap_service.context import AppContext
 from specimap_service.errors import PayloadTooLargeError, QuotaExceededError
@@ -27,13 +28,8 @@ def locked_acquisition(session: Session, acquisition_id: str) -> Acquisition:
     )
     found = session.get(Acquisition, acquisition_id)
     if found is None:
-        raise no_acquisition(acquisition_id)
+        raise not_found(acquisition_id)
     return found
-
-
-def no_acquisition(acquisition_id: str) -> NotFoundError:
-    """Make the error for an unknown acquisition."""
-    return NotFoundError(f"There is no acquisition {acquisition_id}.", advice="GET /v1/acquisitions lists all.")
 
 
 def max_file_bytes(settings: ServiceSettings, role: str) -> int:

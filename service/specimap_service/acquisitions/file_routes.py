@@ -11,14 +11,13 @@ from sqlalchemy.orm import Session
 from specimap_core.errors import NotFoundError
 from specimap_core.photos.formats import MEDIA_TYPES
 from specimap_infra.tables import Acquisition, StoredFile
-from specimap_service.acquisitions.capacity import (
-    locked_acquisition,
-    no_acquisition,
-)
+from specimap_service.acquisitions.capacity import locked_acquisition
 from specimap_service.acquisitions.intake import forget_part
 from specimap_service.acquisitions.routes import check_idle
-from specimap_service.acquisitions.schemas import AcquisitionId, File, FileId
+from specimap_service.acquisitions.schemas import File, FileId
+from specimap_service.auth.access import not_found
 from specimap_service.auth.dependencies import Reader, Uploader
+from specimap_service.auth.object_ids import AcquisitionId
 from specimap_service.byte_ranges import ranged_response
 from specimap_service.context import Context, audit
 
@@ -30,7 +29,7 @@ def list_files(context: Context, principal: Reader, acquisition_id: AcquisitionI
     """List all files with their judgement, in the order of their arrival."""
     with context.database.session() as session:
         if session.get(Acquisition, acquisition_id) is None:
-            raise no_acquisition(acquisition_id)
+            raise not_found(acquisition_id)
         rows = session.scalars(
             sa.select(StoredFile).where(StoredFile.acquisition_id == acquisition_id).order_by(StoredFile.id)
         )
@@ -67,8 +66,8 @@ def delete_file(context: Context, principal: Uploader, acquisition_id: Acquisiti
         row = _found(session, acquisition_id, file_id)
         check_idle(session, acquisition_id)
         forget_part(session, row)
-        session.delete(row)
         audit(session, principal.key_id, "file.delete", file_id, acquisition=acquisition_id, role=row.role)
+        session.delete(row)
     context.storage.delete(row.storage_key)
 
 

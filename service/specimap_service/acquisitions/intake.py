@@ -17,9 +17,10 @@ from specimap_core.atomic import disk_errors
 from specimap_core.errors import NotFoundError
 from specimap_infra.errors import DatabaseUnavailableError, JobConflictError
 from specimap_infra.tables import Acquisition, StoredFile, Upload
-from specimap_service.acquisitions.capacity import check_count, check_quota, locked_acquisition, no_acquisition
+from specimap_service.acquisitions.capacity import check_count, check_quota, locked_acquisition
 from specimap_service.acquisitions.inspection import Arrival, Findings, Known, judged
 from specimap_service.acquisitions.judge import Judge
+from specimap_service.auth.access import not_found
 from specimap_service.context import AppContext, audit
 
 ATTEMPTS = 5
@@ -79,7 +80,7 @@ def _known(context: AppContext, acquisition_id: str) -> Known:
     with context.database.session() as session:
         acquisition = session.get(Acquisition, acquisition_id)
         if acquisition is None:
-            raise no_acquisition(acquisition_id)
+            raise not_found(acquisition_id)
         return Known(acquisition.dictionary, _files(session, acquisition_id))
 
 

@@ -17,14 +17,16 @@ from specimap_infra.errors import JobConflictError
 from specimap_infra.ids import new_id
 from specimap_infra.job_schemas import EdgeMm
 from specimap_infra.tables import FINAL_STATES, Acquisition, Job, StoredFile, Upload
-from specimap_service.acquisitions.capacity import locked_acquisition, no_acquisition
+from specimap_service.acquisitions.capacity import locked_acquisition
 from specimap_service.acquisitions.dependencies import JudgeDep, UnfinishedUploadsDep
-from specimap_service.acquisitions.schemas import AcquisitionId, FileCounts, counts
+from specimap_service.acquisitions.schemas import FileCounts, counts
+from specimap_service.auth.access import in_sight, not_found
 from specimap_service.auth.dependencies import Admin, Reader, Uploader
+from specimap_service.auth.object_ids import AcquisitionId
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import Context, audit
 from specimap_service.jobs.deletion import JobFiles
-from specimap_service.paging import After, Limit, Moment, Page, page_of
+from specimap_service.paging import After, InProject, Limit, Moment, Page, page_of
 
 router = APIRouter(prefix="/v1", tags=["acquisitions"])
 PSEUDONYM = r"^[A-Za-z0-9._-]{1,64}$"
@@ -60,6 +62,7 @@ class AcquisitionView(BaseModel):
     model_config = ConfigDict(title="Acquisition", from_attributes=True)
 
     id: str
+    project_id: str = Field(description="Its project, and that of its files, jobs and results.")
     specimen_id: str
     accession_number: str | None
     dictionary: str
@@ -77,7 +80,13 @@ def create_acquisition(
     context: Context, principal: Uploader, judge: JudgeDep, wanted: AcquisitionRequest
 ) -> AcquisitionView:
     """Create an acquisition; then upload its photos and its cube."""
-    row = Acquisition(id=new_id("acq"), created_by=principal.key_id, created_at=utc_now(), **wanted.model_dump())
+    row = Acquisition(
+        id=new_id("acq"),
+        project_id=principal.project_id,
+        created_by=principal.key_id,
+        created_at=utc_now(),
+        **wanted.model_dump(),
+    )
     with context.database.session() as session:
         session.add(row)
         audit(session, principal.key_id, "acquisition.create", row.id)
@@ -95,11 +104,13 @@ def list_acquisitions(
     accession_number: Annotated[str | None, Query(max_length=64)] = None,
     created_after: Annotated[Moment | None, Query(description="Only those created at this time or later.")] = None,
     created_before: Annotated[Moment | None, Query(description="Only those created before this time.")] = None,
+    project: InProject = None,
     after: After = None,
     limit: Limit = 50,
 ) -> Page[AcquisitionView]:
     """List acquisitions, newest first."""
-    query = sa.select(Acquisition).order_by(Acquisition.id.desc()).limit(limit + 1)
+    query = sa.select(Acquisition).where(in_sight(principal, Acquisition, project))
+    query = query.order_by(Acquisition.id.desc()).limit(limit + 1)
     for column, value in ((Acquisition.specimen_id, specimen_id), (Acquisition.accession_number, accession_number)):
         if value is not None:
             query = query.where(column == value)
@@ -121,7 +132,7 @@ def get_acquisition(context: Context, principal: Reader, acquisition_id: Acquisi
     with context.database.session() as session:
         row = session.get(Acquisition, acquisition_id)
         if row is None:
-            raise no_acquisition(acquisition_id)
+            raise not_found(acquisition_id)
         return _view(session, row)
 
 
@@ -140,8 +151,8 @@ def delete_acquisition(
         jobs = list(session.scalars(sa.select(Job.id).where(Job.acquisition_id == acquisition_id)))
         job_files = JobFiles.of(session, jobs)
         open_uploads = list(session.scalars(sa.select(Upload.id).where(Upload.acquisition_id == acquisition_id)))
-        session.delete(row)
         audit(session, principal.key_id, "acquisition.delete", acquisition_id, jobs=jobs)
+        session.delete(row)
     for upload_id in open_uploads:
         uploads.remove(upload_id)
     context.storage.delete(f"acquisitions/{acquisition_id}")
@@ -164,6 +175,7 @@ def _view(session: Session, row: Acquisition) -> AcquisitionView:
     lacking = missing(session, row.id)
     return AcquisitionView(
         id=row.id,
+        project_id=row.project_id,
         specimen_id=row.specimen_id,
         accession_number=row.accession_number,
         dictionary=row.dictionary,

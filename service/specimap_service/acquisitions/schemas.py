@@ -14,7 +14,6 @@ from specimap_infra.tables import StoredFile
 
 Role = Literal["photo", "cube", "white", "dark"]
 VerdictName = Literal["accepted", "doubtful", "refused"]
-AcquisitionId = Annotated[str, Path(pattern=r"^acq_[0-9a-z]{26}$", examples=["acq_01k0000000000000000000000"])]
 FileId = Annotated[str, Path(pattern=r"^file_[0-9a-z]{26}$", examples=["file_01k0000000000000000000000"])]
 
 

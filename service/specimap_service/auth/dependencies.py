@@ -11,6 +11,7 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from specimap_service.app_state import AppState
+from specimap_service.auth.access import Access
 from specimap_service.auth.keys import Keyring, Principal
 from specimap_service.auth.rate_limit import RateLimiter
 from specimap_service.context import AppContext
@@ -21,16 +22,19 @@ FAILURES_PER_MINUTE = 60
 """Wrong keys that one address may present a minute before it has to wait."""
 KEYRING = AppState[Keyring]("keyring")
 LIMITER = AppState[RateLimiter]("limiter")
+ACCESS = AppState[Access]("access")
 
 
 def _open(app: FastAPI, context: AppContext) -> None:
     settings = context.settings
     KEYRING.set(app, Keyring(context.database, settings.rate_per_minute, settings.quota_bytes))
     LIMITER.set(app, RateLimiter())
+    ACCESS.set(app, Access(context.database))
 
 
 FEATURE = Feature(_open)
 KeyringDep = Annotated[Keyring, Depends(KEYRING.of_request)]
+AccessDep = Annotated[Access, Depends(ACCESS.of_request)]
 PRINCIPAL = "specimap.principal"
 """Key under which a request's ASGI scope holds its principal, once that is known."""
 
@@ -64,15 +68,23 @@ async def authenticated(request: Request) -> Principal:
 _bearer = HTTPBearer(auto_error=False, scheme_name="key", description="`Authorization: Bearer spk_…`")
 
 
+async def known_principal(
+    request: Request, _: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
+) -> Principal:
+    """Return the request's principal: a dependency. What others need of it counts as one request."""
+    # Already known where the request may have a body, which is not read before.
+    found: Principal = request.scope.get(PRINCIPAL) or await authenticated(request)
+    return found
+
+
+Known = Annotated[Principal, Depends(known_principal)]
+
+
 def requires(scope: str) -> Callable[..., Awaitable[Principal]]:
     """Make a dependency: the request's principal, if its key has the scope. ``admin`` has all."""
 
-    async def principal(
-        request: Request, _: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
-    ) -> Principal:
-        # Already known where the request may have a body, which is not read before.
-        found: Principal = request.scope.get(PRINCIPAL) or await authenticated(request)
-        if scope not in found.scopes and "admin" not in found.scopes:
+    async def principal(found: Known) -> Principal:
+        if not found.may(scope):
             raise ForbiddenError(f"The key lacks the scope {scope!r}.", advice="Use a key that has it.", scope=scope)
         return found
 

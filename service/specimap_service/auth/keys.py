@@ -27,15 +27,26 @@ class Principal:
     """The key of a request."""
 
     key_id: str
+    project_id: str
     scopes: frozenset[str]
     rate_per_minute: int
     quota_bytes: int
+
+    @property
+    def is_admin(self) -> bool:
+        """Whether the key has all scopes and sees all projects."""
+        return "admin" in self.scopes
+
+    def may(self, scope: str) -> bool:
+        """Return whether the key has a scope."""
+        return self.is_admin or scope in self.scopes
 
 
 def new_key(
     name: str,
     scopes: Sequence[str],
     *,
+    project_id: str,
     expires_at: datetime.datetime | None = None,
     rate_per_minute: int | None = None,
     quota_bytes: int | None = None,
@@ -44,6 +55,7 @@ def new_key(
     row_id, secret = new_id("key"), secrets.token_hex(32)
     row = ApiKey(
         id=row_id,
+        project_id=project_id,
         name=name,
         secret_hash=_hash(secret),
         scopes=[s for s in SCOPES if s in scopes],
@@ -118,6 +130,7 @@ class Keyring:
                 row.last_used_at = now
             return Principal(
                 row.id,
+                row.project_id,
                 frozenset(row.scopes),
                 row.rate_per_minute or self._defaults[0],
                 row.quota_bytes or self._defaults[1],

@@ -6,30 +6,37 @@ import datetime
 from typing import Annotated, Any, Literal
 
 import sqlalchemy as sa
-from fastapi import APIRouter, Path, Query
+from fastapi import APIRouter, Query
 from pydantic import BaseModel, ConfigDict, Field
 
-from specimap_core.errors import NotFoundError
 from specimap_infra.database import utc_now
+from specimap_infra.projects import found_project
 from specimap_infra.tables import ApiKey, AuditEntry
+from specimap_service.auth.access import in_sight, load
 from specimap_service.auth.dependencies import Admin, KeyringDep
 from specimap_service.auth.keys import new_key
+from specimap_service.auth.object_ids import KeyId
 from specimap_service.context import Context, audit
-from specimap_service.paging import Limit, Moment, Page, page_of
+from specimap_service.paging import InProject, Limit, Moment, Page, page_of
 
 router = APIRouter(prefix="/v1", tags=["keys"])
-KeyId = Annotated[str, Path(pattern=r"^key_[0-9a-z]{26}$")]
 
 
 class KeyRequest(BaseModel):
     """A key to be created."""
 
     model_config = ConfigDict(
-        extra="forbid", json_schema_extra={"example": {"name": "tablet 3", "scopes": ["upload", "read"]}}
+        extra="forbid",
+        json_schema_extra={"example": {"name": "tablet 3", "scopes": ["upload", "read"], "project": "study-7"}},
     )
 
     name: str = Field(min_length=1, max_length=100, description="Whose key it is; no patient's name.")
-    scopes: list[Literal["upload", "read", "label", "admin"]] = Field(min_length=1, fail_fast=True)
+    scopes: list[Literal["upload", "read", "label", "intraoperative", "admin"]] = Field(min_length=1, fail_fast=True)
+    project: str | None = Field(
+        default=None,
+        pattern=r"^[A-Za-z0-9._-]{1,64}$",
+        description="Id or name of its project, for good; by default the project of the key that creates it.",
+    )
     expires_at: Moment | None = None
     rate_per_minute: int | None = Field(default=None, ge=1, le=10_000_000)
     quota_bytes: int | None = Field(default=None, ge=1, le=2**60)
@@ -41,6 +48,7 @@ class Key(BaseModel):
     model_config = ConfigDict(from_attributes=True)
 
     id: str
+    project_id: str
     name: str
     scopes: list[str]
     created_at: datetime.datetime
@@ -65,6 +73,7 @@ class Audited(BaseModel):
     id: int
     at: datetime.datetime
     key_id: str
+    project_id: str = Field(description="The target's project.")
     action: str
     target: str
     details: dict[str, Any]
@@ -74,33 +83,34 @@ class Audited(BaseModel):
 @router.post("/keys", status_code=201)
 def create_key(context: Context, principal: Admin, wanted: KeyRequest) -> NewKey:
     """Create a key."""
-    row, key = new_key(
-        wanted.name,
-        wanted.scopes,
-        expires_at=wanted.expires_at,
-        rate_per_minute=wanted.rate_per_minute,
-        quota_bytes=wanted.quota_bytes,
-    )
     with context.database.session() as session:
+        project_id = principal.project_id if wanted.project is None else found_project(session, wanted.project).id
+        row, key = new_key(
+            wanted.name,
+            wanted.scopes,
+            project_id=project_id,
+            expires_at=wanted.expires_at,
+            rate_per_minute=wanted.rate_per_minute,
+            quota_bytes=wanted.quota_bytes,
+        )
         session.add(row)
         audit(session, principal.key_id, "key.create", row.id, scopes=row.scopes)
     return NewKey(**Key.model_validate(row).model_dump(), key=key)
 
 
 @router.get("/keys")
-def list_keys(context: Context, principal: Admin) -> list[Key]:
+def list_keys(context: Context, principal: Admin, project: InProject = None) -> list[Key]:
     """List all keys, revoked ones too."""
+    query = sa.select(ApiKey).where(in_sight(principal, ApiKey, project)).order_by(ApiKey.id)
     with context.database.session() as session:
-        return [Key.model_validate(row) for row in session.scalars(sa.select(ApiKey).order_by(ApiKey.id))]
+        return [Key.model_validate(row) for row in session.scalars(query)]
 
 
 @router.delete("/keys/{key_id}", status_code=204)
 def revoke_key(context: Context, principal: Admin, keyring: KeyringDep, key_id: KeyId) -> None:
     """Revoke a key; it is refused within two seconds everywhere."""
     with context.database.session() as session:
-        row = session.get(ApiKey, key_id)
-        if row is None:
-            raise NotFoundError(f"There is no key {key_id}.", advice="GET /v1/keys lists all.")
+        row = load(session, principal, ApiKey, key_id)
         row.revoked_at = row.revoked_at or utc_now()
         audit(session, principal.key_id, "key.revoke", key_id)
     keyring.forget()
@@ -113,11 +123,17 @@ def list_audit(
     target: Annotated[
         str | None, Query(pattern=r"^[a-z]{2,5}_[0-9a-z]{26}$", description="Only entries about this object.")
     ] = None,
+    project: InProject = None,
     after: Annotated[int | None, Query(ge=1, description="`next` of the page before.")] = None,
     limit: Limit = 100,
 ) -> Page[Audited]:
     """List the audit trail, newest entry first."""
-    query = sa.select(AuditEntry).order_by(AuditEntry.id.desc()).limit(limit + 1)
+    query = (
+        sa.select(AuditEntry)
+        .where(in_sight(principal, AuditEntry, project))
+        .order_by(AuditEntry.id.desc())
+        .limit(limit + 1)
+    )
     if target is not None:
         query = query.where(AuditEntry.target == target)
     if after is not None:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import datetime
-from typing import Annotated, Any
+from typing import Any
 
 import sqlalchemy as sa
-from fastapi import APIRouter, Path, Request, Response
+from fastapi import APIRouter, Request, Response
 from pydantic import BaseModel, Field
 
 from specimap_core.errors import NotFoundError
@@ -18,13 +18,13 @@ from specimap_infra.labels import current_labels, fingerprint, lock_cloud
 from specimap_infra.queue import EXPORTS, MAKE_EXPORT, enqueue
 from specimap_infra.tables import PRIORITIES
 from specimap_service.auth.dependencies import Reader
+from specimap_service.auth.object_ids import CloudId
 from specimap_service.byte_ranges import REVALIDATED, ranged_response
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.clouds.open_clouds import CloudRecord
 from specimap_service.context import AppContext, Context, audit, correlation_id
 
 router = APIRouter(prefix="/v1/clouds/{cloud_id}/exports", tags=["exports"])
-CloudId = Annotated[str, Path(pattern=r"^cloud_[0-9a-z]{26}$")]
 
 
 class Export(BaseModel):

@@ -32,6 +32,7 @@ from specimap_service.array_responses import (
     json_answer,
 )
 from specimap_service.auth.dependencies import Labeller, Reader
+from specimap_service.auth.object_ids import CloudId
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.clouds.label_body import (
     EXAMPLE_TEXT,
@@ -49,7 +50,6 @@ from specimap_service.context import AppContext, Context
 from specimap_service.errors import MediaTypeError, PayloadTooLargeError
 
 router = APIRouter(prefix="/v1", tags=["labels"])
-CloudId = Annotated[str, Path(pattern=r"^cloud_[0-9a-z]{26}$")]
 LabelName = Annotated[str, Path(pattern=r"^[a-z0-9_-]{1,64}$")]
 Version = Annotated[int | None, Query(ge=1, le=10**9, description="By default the current version.")]
 _BLOCK = 65536

@@ -20,6 +20,7 @@ from specimap_infra.database import Database
 from specimap_infra.labels import current_labels
 from specimap_infra.storage import Storage
 from specimap_infra.tables import CloudRow, Job
+from specimap_service.auth.access import not_found
 
 KEPT_SECONDS = 2.0
 """How long a row is used without a new query: the delay of a deletion, and of a new label in other processes."""
@@ -228,7 +229,7 @@ class OpenClouds:
                 .where(CloudRow.id == cloud_id, Job.state == "succeeded")
             ).one_or_none()
             if row is None:
-                raise NotFoundError(f"There is no cloud {cloud_id}.", advice="GET /v1/clouds lists all.")
+                raise not_found(cloud_id)
             labels = {
                 label.name: LabelRecord(label.name, label.version, label.kind, label.storage_prefix)
                 for label in current_labels(session, cloud_id)

@@ -7,13 +7,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Path, Query, Request, Response
+from fastapi import APIRouter, Depends, Query, Request, Response
 
 from specimap_core import __version__
 from specimap_core.cloud import Cloud
 from specimap_core.errors import NotFoundError
 from specimap_core.json_text import json_text
 from specimap_service.auth.dependencies import Reader
+from specimap_service.auth.object_ids import CloudId
 from specimap_service.clouds import pictures
 from specimap_service.clouds.dependencies import CloudsDep, PicturesDep
 from specimap_service.clouds.label_store import find_label
@@ -24,7 +25,6 @@ from specimap_service.context import Context
 from specimap_service.errors import RequestInvalidError
 
 router = APIRouter(prefix="/v1/clouds/{cloud_id}/previews", tags=["previews"])
-CloudId = Annotated[str, Path(pattern=r"^cloud_[0-9a-z]{26}$")]
 Size = Annotated[int, Query(ge=16, le=LARGEST_SIDE, description="Most pixels of the longer side; never enlarged.")]
 GridChoice = Annotated[
     Grid, Query(description="`cube`: the cube's own pixels; `marker`: from above, x to the right, y up.")

@@ -7,18 +7,19 @@ from typing import Annotated
 
 import numpy as np
 import sqlalchemy as sa
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from specimap_infra.tables import Acquisition, CloudRow, Job
+from specimap_service.auth.access import in_sight
 from specimap_service.auth.dependencies import Reader
+from specimap_service.auth.object_ids import CloudId
 from specimap_service.byte_ranges import ranged_response
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import Context
-from specimap_service.paging import After, Limit, Page, page_of
+from specimap_service.paging import After, InProject, Limit, Page, page_of
 
 router = APIRouter(prefix="/v1", tags=["clouds"])
-CloudId = Annotated[str, Path(pattern=r"^cloud_[0-9a-hjkmnp-tv-z]{26}$")]
 
 
 class CloudSummary(BaseModel):
@@ -53,11 +54,13 @@ def list_clouds(
     principal: Reader,
     acquisition_id: Annotated[str | None, Query(max_length=64)] = None,
     specimen_id: Annotated[str | None, Query(max_length=200)] = None,
+    project: InProject = None,
     after: After = None,
     limit: Limit = 100,
 ) -> Page[CloudSummary]:
     """List finished clouds, newest first."""
     query = sa.select(CloudRow).join(Job, Job.id == CloudRow.job_id).where(Job.state == "succeeded")
+    query = query.where(in_sight(principal, CloudRow, project))
     if acquisition_id is not None:
         query = query.where(CloudRow.acquisition_id == acquisition_id)
     if specimen_id is not None:

@@ -23,11 +23,11 @@ from specimap_service.array_responses import (
     npy_answer,
 )
 from specimap_service.auth.dependencies import Reader
+from specimap_service.auth.object_ids import CloudId
 from specimap_service.body_limits import parsed
 from specimap_service.byte_ranges import CACHED, known_to_client
 from specimap_service.clouds.dependencies import CloudsDep, ParsingDep
 from specimap_service.clouds.open_clouds import CloudRecord
-from specimap_service.clouds.routes import CloudId
 from specimap_service.clouds.spectra import (
     JSON_PAGE,
     MOST_JSON_POINTS,

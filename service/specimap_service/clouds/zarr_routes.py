@@ -15,10 +15,10 @@ from specimap_core.errors import NotFoundError
 from specimap_core.json_text import json_text
 from specimap_infra.storage import Storage
 from specimap_service.auth.dependencies import Reader
+from specimap_service.auth.object_ids import CloudId
 from specimap_service.byte_ranges import CACHED, REVALIDATED, ranged_bytes, ranged_response
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.clouds.open_clouds import CloudRecord, StoredFolder
-from specimap_service.clouds.routes import CloudId
 from specimap_service.context import Context
 
 router = APIRouter(prefix="/v1", tags=["zarr"])

@@ -9,7 +9,6 @@ from dbos import error as dbos_error
 from sqlalchemy.exc import IntegrityError, SQLAlchemyError
 from sqlalchemy.orm import Session
 
-from specimap_core.errors import NotFoundError
 from specimap_infra.completeness import missing
 from specimap_infra.errors import JobConflictError
 from specimap_infra.ids import new_id
@@ -19,27 +18,31 @@ from specimap_infra.logs import logger
 from specimap_infra.queue import JOBS, RUN_JOB, enqueue
 from specimap_infra.tables import FINAL_STATES, PRIORITIES, Acquisition, Job
 from specimap_infra.webhooks import check_target
+from specimap_service.auth.access import load, not_found
+from specimap_service.auth.keys import Principal
 from specimap_service.clouds.open_clouds import OpenClouds
 from specimap_service.context import AppContext, audit, correlation_id
-from specimap_service.errors import IdempotencyConflictError, UploadIncompleteError
+from specimap_service.errors import ForbiddenError, IdempotencyConflictError, UploadIncompleteError
 from specimap_service.jobs.deletion import JobFiles
 from specimap_service.jobs.schemas import JobRequest, RerunRequest, Webhook
 
 
-def new_job(context: AppContext, key_id: str, wanted: JobRequest, idempotency_key: str | None) -> tuple[JobView, bool]:
+def new_job(
+    context: AppContext, principal: Principal, wanted: JobRequest, idempotency_key: str | None
+) -> tuple[JobView, bool]:
     """Create a job on an acquisition; return it, and whether it is new.
 
     Raises:
         NotFoundError: there is no such acquisition.
+        ForbiddenError: the key may not ask for this priority.
         UploadIncompleteError: something is missing; ``details['missing']``.
         SettingsError: the webhook's host is not allowed.
         IdempotencyConflictError: the idempotency key belongs to another request.
     """
 
     def row(session: Session) -> Job:
-        acquisition = session.get(Acquisition, wanted.acquisition_id)
-        if acquisition is None:
-            raise _no_acquisition(wanted.acquisition_id)
+        acquisition = load(session, principal, Acquisition, wanted.acquisition_id)
+        _check_priority(principal, PRIORITIES[wanted.priority])
         return Job(
             acquisition_id=acquisition.id,
             settings=wanted.settings.on(acquisition),
@@ -47,17 +50,17 @@ def new_job(context: AppContext, key_id: str, wanted: JobRequest, idempotency_ke
             webhook=_checked_webhook(context, wanted.webhook),
         )
 
-    return _create_once(context, key_id, idempotency_key, wanted.digest(), row)
+    return _create_once(context, principal.key_id, idempotency_key, wanted.digest(), row)
 
 
 def repeated_job(
-    context: AppContext, key_id: str, job_id: str, wanted: RerunRequest, idempotency_key: str | None
+    context: AppContext, principal: Principal, job_id: str, wanted: RerunRequest, idempotency_key: str | None
 ) -> tuple[JobView, bool]:
     """Create a job with an earlier one's settings, but for those given; return it, and whether it is new.
 
     Raises:
         NotFoundError: there is no such job.
-        UploadIncompleteError, SettingsError, IdempotencyConflictError: as for :func:`new_job`.
+        ForbiddenError, UploadIncompleteError, SettingsError, IdempotencyConflictError: as for :func:`new_job`.
     """
 
     def row(session: Session) -> Job:
@@ -66,22 +69,24 @@ def repeated_job(
         webhook = wanted.webhook
         if "webhook" not in wanted.model_fields_set and earlier.webhook is not None:
             webhook = Webhook(**earlier.webhook)
+        priority = PRIORITIES[wanted.priority] if wanted.priority else earlier.priority
+        _check_priority(principal, priority)
         return Job(
             acquisition_id=earlier.acquisition_id,
             settings=job_settings({**earlier.settings, **changed}).model_dump(),
-            priority=PRIORITIES[wanted.priority] if wanted.priority else earlier.priority,
+            priority=priority,
             webhook=_checked_webhook(context, webhook),
             rerun_of=earlier.id,
         )
 
-    return _create_once(context, key_id, idempotency_key, wanted.digest(job_id), row)
+    return _create_once(context, principal.key_id, idempotency_key, wanted.digest(job_id), row)
 
 
 def found_job(session: Session, job_id: str) -> Job:
     """Return the job's row. Raises NotFoundError."""
     job = session.get(Job, job_id)
     if job is None:
-        raise NotFoundError(f"There is no job {job_id}.", advice="Check the id; it may have been deleted.")
+        raise not_found(job_id)
     return job
 
 
@@ -115,7 +120,7 @@ def _create_once(
         # The same request was made twice at once, or the acquisition was deleted.
         earlier = _find_repeated(context, key_id, idempotency_key, digest)
         if earlier is None:
-            raise _no_acquisition(job.acquisition_id) from error
+            raise not_found(job.acquisition_id) from error
         return earlier, False
 
 
@@ -135,15 +140,21 @@ def _find_repeated(context: AppContext, key_id: str, idempotency_key: str | None
         return job_views(session, [job])[0]
 
 
+def _check_priority(principal: Principal, priority: int) -> None:
+    """Raise ForbiddenError where a key asks for theatre's place in the queue without the right to it."""
+    if priority == PRIORITIES["intraoperative"] and not principal.may("intraoperative"):
+        raise ForbiddenError(
+            "The key may not create jobs of the priority intraoperative.",
+            advice="Ask for the priority routine, or use a key that has the scope intraoperative.",
+            scope="intraoperative",
+        )
+
+
 def _checked_webhook(context: AppContext, webhook: Webhook | None) -> dict[str, str] | None:
     if webhook is None:
         return None
     check_target(webhook.url, context.settings)
     return webhook.model_dump()
-
-
-def _no_acquisition(acquisition_id: str) -> NotFoundError:
-    return NotFoundError(f"There is no acquisition {acquisition_id}.", advice="Check the id; it may have been deleted.")
 
 
 # ---- cancelling and deleting --------------------------------------------------------------------------
@@ -167,8 +178,8 @@ def delete_job(context: AppContext, clouds: OpenClouds, key_id: str, job_id: str
         if job.state not in FINAL_STATES:
             raise JobConflictError(f"Job {job_id} is {job.state}.", advice="Cancel it first.", state=job.state)
         acquisition, files = job.acquisition_id, JobFiles.of(session, [job_id])
-        session.execute(sa.delete(Job).where(Job.id == job_id))
         audit(session, key_id, "job.delete", job_id, acquisition=acquisition)
+        session.execute(sa.delete(Job).where(Job.id == job_id))
     _call_engine(context.queue.delete_workflow, job_id)
     files.remove(context.storage, clouds)
 

@@ -17,7 +17,9 @@ from specimap_infra.errors import JobConflictError
 from specimap_infra.job_schemas import JobState, JobView, job_views
 from specimap_infra.jobs import locked, request_cancel
 from specimap_infra.tables import FINAL_STATES, CloudRow, Job, JobEvent
+from specimap_service.auth.access import in_sight
 from specimap_service.auth.dependencies import Admin, Reader, Uploader
+from specimap_service.auth.object_ids import JobId
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import AppContext, Context, audit
 from specimap_service.jobs.commands import delete_job, found_job, new_job, repeated_job, stop_workflow
@@ -27,13 +29,12 @@ from specimap_service.jobs.schemas import (
     AfterJob,
     AfterSeq,
     IdempotencyKey,
-    JobId,
     JobRequest,
     LastEventId,
     LogLine,
     RerunRequest,
 )
-from specimap_service.paging import Limit, Moment, Page, page_of
+from specimap_service.paging import InProject, Limit, Moment, Page, page_of
 
 router = APIRouter(prefix="/v1", tags=["jobs"])
 
@@ -51,7 +52,7 @@ def create_job(
     idempotency_key: IdempotencyKey = None,
 ) -> JobView:
     """Queue a job on a complete acquisition."""
-    return _answer(response, *new_job(context, principal.key_id, wanted, idempotency_key))
+    return _answer(response, *new_job(context, principal, wanted, idempotency_key))
 
 
 @router.post("/jobs/{job_id}/rerun", status_code=202, responses=REPEATED)
@@ -64,9 +65,7 @@ def rerun_job(
     idempotency_key: IdempotencyKey = None,
 ) -> JobView:
     """Queue this job again with other settings; stages that they do not change are not repeated."""
-    return _answer(
-        response, *repeated_job(context, principal.key_id, job_id, wanted or RerunRequest(), idempotency_key)
-    )
+    return _answer(response, *repeated_job(context, principal, job_id, wanted or RerunRequest(), idempotency_key))
 
 
 def _answer(response: Response, job: JobView, made: bool) -> JobView:
@@ -83,11 +82,12 @@ def list_jobs(
     state: Annotated[list[JobState] | None, Query(description="Any of these states.")] = None,
     created_after: Moment | None = None,
     created_before: Moment | None = None,
+    project: InProject = None,
     after: AfterJob = None,
     limit: Limit = 100,
 ) -> Page[JobView]:
     """List jobs, newest first."""
-    query = sa.select(Job).order_by(Job.id.desc()).limit(limit + 1)
+    query = sa.select(Job).where(in_sight(principal, Job, project)).order_by(Job.id.desc()).limit(limit + 1)
     if acquisition_id is not None:
         query = query.where(Job.acquisition_id == acquisition_id)
     if state:

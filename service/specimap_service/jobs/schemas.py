@@ -6,13 +6,12 @@ import datetime
 import hashlib
 from typing import Annotated, Any
 
-from fastapi import Header, Path, Query
+from fastapi import Header, Query
 from pydantic import BaseModel, ConfigDict, Field
 
 from specimap_core.json_text import json_text
 from specimap_infra.job_schemas import JobSettings, PriorityName
 
-JobId = Annotated[str, Path(pattern=r"^job_[0-9a-z]{26}$")]
 AfterJob = Annotated[str | None, Query(pattern=r"^job_[0-9a-z]{26}$", description="`next` of the page before.")]
 AfterSeq = Annotated[int | None, Query(ge=0, lt=2**31, description="Only events after the one of this number.")]
 IdempotencyKey = Annotated[

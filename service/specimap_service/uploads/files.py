@@ -13,8 +13,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from specimap_core.atomic import disk_errors
-from specimap_core.errors import NotFoundError
 from specimap_infra.ids import PATTERN
+from specimap_service.auth.access import no_upload
 from specimap_service.errors import UploadLockedError
 
 POLL_SECONDS = 0.05
@@ -94,11 +94,6 @@ class UploadFiles:
                 if path.name.partition(".")[0] not in known and time.time() - path.stat().st_mtime > seconds:
                     found.append(path)
         return found
-
-
-def no_upload() -> NotFoundError:
-    """Make the error for an unknown upload."""
-    return NotFoundError("There is no such upload.", advice="Create one with POST /v1/uploads.")
 
 
 def busy() -> UploadLockedError:

@@ -14,14 +14,15 @@ from specimap_service.acquisitions.capacity import (
     check_disks,
     check_size,
     max_file_bytes,
-    no_acquisition,
     quota_left,
 )
 from specimap_service.acquisitions.inspection import Arrival
 from specimap_service.acquisitions.intake import clean_name, take_in
-from specimap_service.acquisitions.schemas import AcquisitionId, File
+from specimap_service.acquisitions.schemas import File
+from specimap_service.auth.access import not_found
 from specimap_service.auth.dependencies import Uploader
 from specimap_service.auth.keys import Principal
+from specimap_service.auth.object_ids import AcquisitionId
 from specimap_service.context import AppContext, Context
 from specimap_service.errors import QuotaExceededError, RequestInvalidError
 from specimap_service.uploads.dependencies import UploadsDep
@@ -112,7 +113,7 @@ def _limits(context: AppContext, principal: Principal, request: Request, acquisi
     settings = context.settings
     with context.database.session() as session:
         if session.get(Acquisition, acquisition_id) is None:
-            raise no_acquisition(acquisition_id)
+            raise not_found(acquisition_id)
         left = quota_left(session, principal)
     check_disks(context, announced)
     # Boundaries, headers and fields of the form count as a mebibyte.

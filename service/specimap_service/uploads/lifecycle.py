@@ -21,16 +21,17 @@ from specimap_infra.database import utc_now
 from specimap_infra.errors import JobConflictError
 from specimap_infra.ids import new_id
 from specimap_infra.logs import logger
-from specimap_infra.tables import ROLES, StoredFile, Upload
+from specimap_infra.tables import ROLES, Acquisition, StoredFile, Upload
 from specimap_service.acquisitions.capacity import check_count, check_disks, check_quota, check_size, locked_acquisition
 from specimap_service.acquisitions.inspection import Arrival
 from specimap_service.acquisitions.intake import clean_name, take_in
 from specimap_service.acquisitions.judge import Judge
 from specimap_service.acquisitions.schemas import counts
+from specimap_service.auth.access import load, no_upload
 from specimap_service.auth.keys import Principal
 from specimap_service.context import AppContext, audit
 from specimap_service.errors import ForbiddenError, RequestInvalidError, UploadGoneError
-from specimap_service.uploads.files import UploadFiles, no_upload
+from specimap_service.uploads.files import UploadFiles
 
 ABANDONED_SECONDS = 3600.0
 FINISH_SECONDS = 60.0
@@ -86,6 +87,7 @@ class Uploads:
         self.files.create(upload.id)
         try:
             with self.context.database.session() as session:
+                load(session, principal, Acquisition, acquisition_id)
                 locked_acquisition(session, acquisition_id)
                 if role == "photo":
                     check_count(session, self.context.settings, acquisition_id, 1)
@@ -112,13 +114,14 @@ class Uploads:
         """Return the upload as it stands; finish one whose last byte arrived in a process that died.
 
         Raises:
-            NotFoundError: there is none.
-            ForbiddenError: another key created it.
+            NotFoundError: there is none in the key's project.
+            ForbiddenError: another key of the project created it.
             UploadGoneError: it expired or was ended.
         """
         self.files.path(upload_id)
-        upload = self._row(upload_id)
-        if upload.created_by != principal.key_id and "admin" not in principal.scopes:
+        with self.context.database.session() as session:
+            upload = load(session, principal, Upload, upload_id)
+        if upload.created_by != principal.key_id and not principal.is_admin:
             raise ForbiddenError(
                 "Another key created this upload.", advice="Use that key, or one with the scope admin."
             )

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, cast
+from typing import Literal, cast
 
-from fastapi import APIRouter, Path, Response
+from fastapi import APIRouter, Response
 from pydantic import BaseModel, Field
 
 from specimap_service.acquisitions.schemas import File
 from specimap_service.auth.dependencies import Uploader
+from specimap_service.auth.object_ids import UploadId
 from specimap_service.context import Context
 from specimap_service.uploads import tus
 from specimap_service.uploads.dependencies import UploadsDep
 
 router = APIRouter(prefix="/v1", tags=["uploads"])
-UploadId = Annotated[str, Path(pattern=r"^up_[0-9a-z]{26}$", examples=["up_01k0000000000000000000000"])]
 State = Literal["open", "finished", "failed", "expired", "terminated"]
 
 

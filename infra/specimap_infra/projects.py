@@ -1,0 +1,134 @@
+"""Projects: to which one each object belongs.
+
+A key and an acquisition name their project. Everything else belongs to the project of its acquisition, whoever made it,
+so that an acquisition and its results are never divided.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session, aliased
+
+from specimap_core.errors import NotFoundError, SettingsError
+from specimap_infra.database import utc_now
+from specimap_infra.errors import JobConflictError
+from specimap_infra.ids import new_id
+from specimap_infra.tables import (
+    Acquisition,
+    ApiKey,
+    AuditEntry,
+    Base,
+    CloudRow,
+    Export,
+    Job,
+    Project,
+    StoredFile,
+    Upload,
+)
+
+DEFAULT_PROJECT = "prj_00000000000000000000000000"
+"""The project of everything from before there were projects, and of the first key."""
+PROJECT_NAME = r"^(?!prj_)[A-Za-z0-9._-]{1,64}$"
+"""A pseudonym, like a specimen's; never to be mistaken for an id."""
+
+_OWNERS: dict[str, sa.Select[str]] = {
+    "prj": sa.select(Project.id),
+    "key": sa.select(ApiKey.project_id),
+    "acq": sa.select(Acquisition.project_id),
+    **{
+        kind: sa.select(Acquisition.project_id)
+        .select_from(table)
+        .join(Acquisition, Acquisition.id == table.acquisition_id)
+        for kind, table in (("file", StoredFile), ("up", Upload), ("job", Job), ("cloud", CloudRow))
+    },
+    "exp": sa.select(Acquisition.project_id)
+    .select_from(Export)
+    .join(CloudRow, CloudRow.id == Export.cloud_id)
+    .join(Acquisition, Acquisition.id == CloudRow.acquisition_id),
+}
+_IDS = {
+    "prj": Project.id,
+    "key": ApiKey.id,
+    "acq": Acquisition.id,
+    "file": StoredFile.id,
+    "up": Upload.id,
+    "job": Job.id,
+    "cloud": CloudRow.id,
+    "exp": Export.id,
+}
+
+
+def project_of(session: Session, object_id: str) -> str | None:
+    """Return the project of the object with an id of any kind; None where there is no such object."""
+    kind = object_id.partition("_")[0]
+    return session.scalar(_OWNERS[kind].where(_IDS[kind] == object_id))
+
+
+def within(table: type[Base], projects: sa.Select[str] | str) -> sa.ColumnElement[bool]:
+    """Make the condition that rows of a table belong to a project, or to one of several."""
+
+    def is_one(column: Any) -> sa.ColumnElement[bool]:
+        found: sa.ColumnElement[bool] = column == projects if isinstance(projects, str) else column.in_(projects)
+        return found
+
+    if table is Project:
+        return is_one(Project.id)
+    columns: Any = table
+    if table in (Acquisition, ApiKey, AuditEntry):
+        return is_one(columns.project_id)
+    # An alias, since the query may have acquisitions too. Not `in`, which SQLite would begin with: it would then sort
+    # all that a large project has for each page.
+    owner = aliased(Acquisition)
+    return sa.exists().where(owner.id == columns.acquisition_id, is_one(owner.project_id))
+
+
+def named(wanted: str) -> sa.ColumnElement[bool]:
+    """Make the condition that a project has this id or this name."""
+    return sa.or_(Project.id == wanted, Project.name == wanted)
+
+
+def found_project(session: Session, wanted: str) -> Project:
+    """Return a project by its id or its name. Raises NotFoundError."""
+    found = session.scalar(sa.select(Project).where(named(wanted)))
+    if found is None:
+        raise no_project(wanted)
+    return found
+
+
+def no_project(wanted: str) -> NotFoundError:
+    """Make the error for an unknown project."""
+    return NotFoundError(
+        f"There is no project {wanted}.", advice="GET /v1/projects or `specimap projects list` shows what there is."
+    )
+
+
+def new_project(session: Session, name: str) -> Project:
+    """Create a project. Raises as :func:`rename_project` does."""
+    project = Project(id=new_id("prj"), name=name, created_at=utc_now())
+    session.add(project)
+    rename_project(session, project, name)
+    return project
+
+
+def rename_project(session: Session, project: Project, name: str) -> None:
+    """Give a project a name. An error ends the caller's transaction.
+
+    Raises:
+        SettingsError: the name is not a pseudonym.
+        JobConflictError: another project has it.
+    """
+    if not re.match(PROJECT_NAME, name):
+        raise SettingsError(
+            "A project's name has 1 to 64 letters, digits, dots, dashes and underscores, and does not begin with prj_.",
+            advice="Give another name; no patient's.",
+            setting="name",
+        )
+    project.name = name
+    try:
+        session.flush()
+    except IntegrityError as error:
+        raise JobConflictError(f"Another project is called {name}.", advice="Give another name.") from error

@@ -1,0 +1,93 @@
+"""Which objects a key may touch: those of its project; an administrator's key all.
+
+An object of another project is answered exactly like one that does not exist: both are looked for by the same query,
+and refused by the same error.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from typing import TypeVar
+
+import sqlalchemy as sa
+from sqlalchemy.orm import Session
+
+from specimap_core.errors import NotFoundError
+from specimap_infra.database import Database
+from specimap_infra.projects import named, no_project, project_of, within
+from specimap_infra.tables import Base, Project
+from specimap_service.auth.keys import Principal
+
+_MOST_KNOWN = 20_000
+_ADVICE = {
+    "acq": ("acquisition", "GET /v1/acquisitions lists all."),
+    "job": ("job", "Check the id; it may have been deleted."),
+    "cloud": ("cloud", "GET /v1/clouds lists all."),
+    "key": ("key", "GET /v1/keys lists all."),
+}
+Row = TypeVar("Row", bound=Base)
+
+
+def no_upload() -> NotFoundError:
+    """Make the error for an unknown upload; it repeats no text that may be no id."""
+    return NotFoundError("There is no such upload.", advice="Create one with POST /v1/uploads.")
+
+
+def not_found(object_id: str) -> NotFoundError:
+    """Make the error for an object that does not exist, or that the key may not see."""
+    kind = object_id.partition("_")[0]
+    if kind == "prj":
+        return no_project(object_id)
+    if kind == "up":
+        return no_upload()
+    noun, advice = _ADVICE[kind]
+    return NotFoundError(f"There is no {noun} {object_id}.", advice=advice)
+
+
+def load(session: Session, principal: Principal, table: type[Row], object_id: str) -> Row:
+    """Return the row of an object that the key may touch. Raises NotFoundError."""
+    query = sa.select(table).where(table.__table__.c.id == object_id, in_sight(principal, table))
+    found: Row | None = session.scalars(query).one_or_none()
+    if found is None:
+        raise not_found(object_id)
+    return found
+
+
+def in_sight(principal: Principal, table: type[Base], project: str | None = None) -> sa.ColumnElement[bool]:
+    """Make the condition on rows of a list: those that the key may touch.
+
+    ``project``: only those of the project of this id or name.
+    """
+    if project is None:
+        return sa.true() if principal.is_admin else within(table, principal.project_id)
+    wanted = sa.select(Project.id).where(named(project))
+    return within(table, wanted if principal.is_admin else wanted.where(Project.id == principal.project_id))
+
+
+class Access:
+    """The check of the ids in addresses. Safe to share between threads."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._known: OrderedDict[str, str] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def is_known(self, principal: Principal, object_id: str) -> bool:
+        """Return whether the key may touch the object, if that is known without a query.
+
+        The object may have been deleted since: whoever loads it finds out.
+        """
+        # Its project never changes. Whatever another project has is unknown: it takes a query as if it did not exist.
+        return principal.is_admin or self._known.get(object_id) == principal.project_id
+
+    def check(self, principal: Principal, object_id: str) -> None:
+        """Raise NotFoundError unless the key may touch the object."""
+        with self._database.session() as session:
+            project = project_of(session, object_id)
+        if project is None or project != principal.project_id:
+            raise not_found(object_id)
+        with self._lock:
+            self._known[object_id] = project
+            if len(self._known) > _MOST_KNOWN:
+                self._known.popitem(last=False)

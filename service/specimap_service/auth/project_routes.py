@@ -1,0 +1,73 @@
+"""Projects: groups of keys that share their objects. Created and renamed by an administrator."""
+
+from __future__ import annotations
+
+import datetime
+from typing import Annotated
+
+import sqlalchemy as sa
+from fastapi import APIRouter
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+
+from specimap_infra.projects import new_project, rename_project
+from specimap_infra.tables import Project as ProjectRow
+from specimap_service.auth.access import in_sight, load
+from specimap_service.auth.dependencies import Admin, Reader
+from specimap_service.auth.object_ids import ProjectId
+from specimap_service.context import Context, audit
+
+router = APIRouter(prefix="/v1", tags=["projects"])
+
+
+class ProjectRequest(BaseModel):
+    """The name of a project."""
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"example": {"name": "study-7"}})
+
+    name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9._-]{1,64}$")] = Field(
+        description="Letters, digits, dot, dash, underscore; no patient's name. It does not begin with `prj_`."
+    )
+
+
+class Project(BaseModel):
+    """A group of keys that share their objects."""
+
+    model_config = ConfigDict(from_attributes=True)
+
+    id: str
+    name: str
+    created_at: datetime.datetime
+
+
+@router.post("/projects", status_code=201)
+def create_project(context: Context, principal: Admin, wanted: ProjectRequest) -> Project:
+    """Create a project; then create its keys."""
+    with context.database.session() as session:
+        row = new_project(session, wanted.name)
+        audit(session, principal.key_id, "project.create", row.id)
+    return Project.model_validate(row)
+
+
+@router.get("/projects")
+def list_projects(context: Context, principal: Reader) -> list[Project]:
+    """List the projects that the key sees: its own, for an administrator all."""
+    with context.database.session() as session:
+        query = sa.select(ProjectRow).where(in_sight(principal, ProjectRow)).order_by(ProjectRow.id)
+        return [Project.model_validate(row) for row in session.scalars(query)]
+
+
+@router.get("/projects/{project_id}")
+def get_project(context: Context, principal: Reader, project_id: ProjectId) -> Project:
+    """Return one project."""
+    with context.database.session() as session:
+        return Project.model_validate(load(session, principal, ProjectRow, project_id))
+
+
+@router.patch("/projects/{project_id}")
+def change_project(context: Context, principal: Admin, project_id: ProjectId, wanted: ProjectRequest) -> Project:
+    """Rename a project. Its id, its keys and its objects stay as they are."""
+    with context.database.session() as session:
+        row = load(session, principal, ProjectRow, project_id)
+        rename_project(session, row, wanted.name)
+        audit(session, principal.key_id, "project.rename", row.id)
+    return Project.model_validate(row)
