@@ -59,6 +59,8 @@ HTTP_STATUS: dict[type[SpecimapError], int] = {
     service.RangeNotSatisfiableError: 416,
     service.RateLimitedError: 429,
     service.RequestInvalidError: 422,
+    service.RequestTimeoutError: 408,
+    service.TooManyConnectionsError: 503,
     service.UnauthorizedError: 401,
     service.UploadConflictError: 409,
     service.UploadGoneError: 410,
