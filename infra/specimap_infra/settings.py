@@ -94,12 +94,12 @@ class ServiceSettings(BaseSettings):
     quota_bytes: int = Field(
         default=200 * GIB,
         ge=1,
-        description="Bytes that the acquisitions of one key may hold, unless the key says otherwise.",
+        description="Bytes that the acquisitions and labels of one key may hold, unless the key says otherwise.",
     )
     min_free_bytes: int = Field(
         default=2 * GIB,
         ge=0,
-        description="Free space below which new uploads are refused, so that running jobs can finish.",
+        description="Free space below which new uploads and labels are refused, so that running jobs can finish.",
     )
     upload_hours: float = Field(default=48, gt=0, description="Hours after which an unfinished upload is dropped.")
     judge_seconds: float = Field(default=60, gt=0, description="Longest time that the judging of one file may take.")

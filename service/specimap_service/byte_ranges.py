@@ -67,6 +67,12 @@ def known_to_client(request: Request, etag: str) -> bool:
     return known is not None and _matches(known, etag, weakly=True)
 
 
+def names_tag(request: Request, etag: str) -> bool:
+    """Return whether If-None-Match holds the quoted ETag itself; `*` needs to be known to exist first."""
+    known = request.headers.get("if-none-match", "")
+    return known.strip() != "*" and _matches(known, etag, weakly=True)
+
+
 def _answer(request: Request, source: _Source, media_type: str, filename: str | None, cache: str) -> Response:
     etag = f'"{source.etag}"'
     headers = {"ETag": etag, "Cache-Control": cache, "Accept-Ranges": "bytes", "Vary": "Authorization"}

@@ -15,6 +15,7 @@ import httpx
 import pytest
 
 from specimap_service.connections import LARGEST_HEAD
+from tests.support.result_scene import put_result
 from tests.support.service_scene import Running, serving
 
 PIECE = b"a" * 16384
@@ -169,6 +170,38 @@ def test_a_body_that_stops_is_refused_quietly(
         assert b'"code":"request_timeout"' in output
         assert b"connection: close" in output
     assert "Traceback" not in capfd.readouterr().err
+
+
+CUT = {
+    "JSON": ("POST", "/v1/acquisitions", "Content-Type: application/json"),
+    "selection": ("POST", "/v1/clouds/{cloud}/spectra", "Content-Type: application/json"),
+    "form": ("POST", "/v1/acquisitions/{acquisition}/files", "Content-Type: multipart/form-data; boundary=x"),
+    "labels": ("PUT", "/v1/clouds/{cloud}/labels/x", 'Content-Type: application/x-npy\r\nX-Specimap-Label: {{"kind": '
+    '"probability", "made_by": {{"name": "x"}}}}'),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", CUT)
+def test_a_client_that_goes_away_is_no_failure(
+    shared: Running, tmp_path: Path, what: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    client = shared.client()
+    acquisition = client.post("/v1/acquisitions", json={"specimen_id": "S"}).json()["id"]
+    cloud = put_result(shared, tmp_path / "result").cloud_id if "cloud" in CUT[what][1] else ""
+    method, path, headers = (text.format(acquisition=acquisition, cloud=cloud) for text in CUT[what])
+    key = client.headers["Authorization"]
+    before = set(shared.settings.scratch.rglob("*"))
+    with connected(shared) as connection:
+        connection.sendall(
+            f"{method} {path} HTTP/1.1\r\nHost: x\r\nAuthorization: {key}\r\n{headers}\r\n"
+            "Content-Length: 9000\r\n\r\n--x\r\n".encode()
+        )
+        until(lambda: bool(shared.server.server_state.tasks))
+        time.sleep(0.1)
+    until(lambda: not shared.server.server_state.tasks)
+    assert capfd.readouterr() == ("", "")
+    assert "500" not in "".join(line for line in client.get("/metrics").text.splitlines() if 'status="5' in line)
+    assert set(shared.settings.scratch.rglob("*")) == before
 
 
 def test_a_body_that_goes_on_takes_as_long_as_it_takes(quick: Running) -> None:

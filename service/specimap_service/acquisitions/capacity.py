@@ -1,4 +1,4 @@
-"""Limits on arriving files: their size and number, the key's quota, free disk space."""
+"""Limits on arriving files and labels: size and number, the key's quota, free disk space."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ from sqlalchemy.orm import Session
 from specimap_core.atomic import disk_errors
 from specimap_core.errors import NotFoundError, StorageFullError
 from specimap_infra.settings import ServiceSettings
-from specimap_infra.tables import Acquisition, ApiKey, StoredFile, Upload
+from specimap_infra.tables import Acquisition, ApiKey, LabelVersion, StoredFile, Upload
 from specimap_service.auth.keys import Principal
 from specimap_service.context import AppContext
 from specimap_service.errors import PayloadTooLargeError, QuotaExceededError
+
+DISK_EVERY = 64 * 1024 * 1024
+"""Bytes of an arriving body after which the disks are looked at again."""
 
 
 def locked_acquisition(session: Session, acquisition_id: str) -> Acquisition:
@@ -79,11 +82,16 @@ def check_quota(session: Session, principal: Principal, new: int) -> None:
         execution_options={"synchronize_session": False},
     )
     if new > quota_left(session, principal):
-        raise QuotaExceededError(
-            f"With {new} bytes more the key is over its quota of {principal.quota_bytes} bytes.",
-            advice="Delete acquisitions that are no longer needed, or ask the administrator for a higher quota.",
-            quota_bytes=principal.quota_bytes,
-        )
+        raise over_quota(principal, new)
+
+
+def over_quota(principal: Principal, new: int) -> QuotaExceededError:
+    """Make the error for ``new`` more bytes than the key's quota allows."""
+    return QuotaExceededError(
+        f"With {new} bytes more the key is over its quota of {principal.quota_bytes} bytes.",
+        advice="Delete acquisitions or labels that are no longer needed, or ask the administrator for a higher quota.",
+        quota_bytes=principal.quota_bytes,
+    )
 
 
 def quota_left(session: Session, principal: Principal) -> int:
@@ -92,7 +100,10 @@ def quota_left(session: Session, principal: Principal) -> int:
     coming = session.scalar(
         sa.select(sa.func.sum(Upload.size)).where(Upload.created_by == principal.key_id, Upload.state == "open")
     )
-    return principal.quota_bytes - int(stored or 0) - int(coming or 0)
+    labels = session.scalar(
+        sa.select(sa.func.sum(LabelVersion.size)).where(LabelVersion.created_by == principal.key_id)
+    )
+    return principal.quota_bytes - int(stored or 0) - int(coming or 0) - int(labels or 0)
 
 
 def check_disks(context: AppContext, new: int, coming: int = 0) -> None:

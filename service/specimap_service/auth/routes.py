@@ -15,6 +15,7 @@ from specimap_infra.tables import ApiKey, AuditEntry
 from specimap_service.auth.dependencies import Admin, KeyringDep
 from specimap_service.auth.keys import new_key
 from specimap_service.context import Context, audit
+from specimap_service.errors import RequestInvalidError
 from specimap_service.paging import Limit, Moment, Page, page_of
 
 router = APIRouter(prefix="/v1", tags=["keys"])
@@ -30,7 +31,7 @@ class KeyRequest(BaseModel):
 
     name: str = Field(min_length=1, max_length=100, description="Whose key it is; no patient's name.")
     scopes: list[Literal["upload", "read", "label", "admin"]] = Field(min_length=1, fail_fast=True)
-    expires_at: Moment | None = None
+    expires_at: Moment | None = Field(default=None, description="From when on it is refused; not in the past.")
     rate_per_minute: int | None = Field(default=None, ge=1, le=10_000_000)
     quota_bytes: int | None = Field(default=None, ge=1, le=2**60)
 
@@ -74,6 +75,12 @@ class Audited(BaseModel):
 @router.post("/keys", status_code=201)
 def create_key(context: Context, principal: Admin, wanted: KeyRequest) -> NewKey:
     """Create a key."""
+    if wanted.expires_at is not None and wanted.expires_at <= utc_now():
+        raise RequestInvalidError(
+            "body.expires_at: the time has passed.",
+            advice="Give a later time, with its zone.",
+            fields=[{"where": "body.expires_at", "what": "the time has passed"}],
+        )
     row, key = new_key(
         wanted.name,
         wanted.scopes,

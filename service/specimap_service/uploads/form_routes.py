@@ -10,6 +10,7 @@ from fastapi import APIRouter, Request
 from specimap_infra.ids import new_id
 from specimap_infra.tables import Acquisition
 from specimap_service.acquisitions.capacity import (
+    DISK_EVERY,
     check_count,
     check_disks,
     check_size,
@@ -29,7 +30,6 @@ from specimap_service.uploads.lifecycle import Uploads
 from specimap_service.uploads.multipart import FormFiles, Part
 
 router = APIRouter(prefix="/v1", tags=["files"])
-DISK_EVERY = 64 * 1024 * 1024
 FORM: dict[str, Any] = {
     "requestBody": {
         "required": True,
