@@ -20,6 +20,7 @@ from specimap_core.errors import NotFoundError
 from specimap_infra.errors import StorageUnavailableError
 from specimap_infra.storage import Storage
 from specimap_service.errors import PreconditionFailedError, RangeNotSatisfiableError
+from specimap_service.head_requests import only_head
 from specimap_service.problems import problem_response
 
 PIECE = 1024 * 1024
@@ -92,7 +93,7 @@ def _answer(request: Request, source: _Source, media_type: str, filename: str | 
     start, stop, status = 0, source.size, 200
     wanted_range = asked.get("range")
     # Ranges are defined for GET only; If-Range says: the range if the file is still this one, else all of it.
-    if wanted_range is not None and request.method == "GET" and asked.get("if-range", etag) == etag:
+    if wanted_range is not None and not only_head(request) and asked.get("if-range", etag) == etag:
         try:
             found = _parsed(wanted_range, source.size)
         except RangeNotSatisfiableError as error:
@@ -101,7 +102,7 @@ def _answer(request: Request, source: _Source, media_type: str, filename: str | 
             start, stop, status = *found, 206
             headers["Content-Range"] = f"bytes {start}-{stop - 1}/{source.size}"
     headers["Content-Length"] = str(stop - start)
-    if request.method == "HEAD":
+    if only_head(request):
         return Response(None, status, headers, media_type)
     if stop - start <= PIECE:
         # This runs in a thread already: a small file needs no other.

@@ -107,6 +107,12 @@ class MediaTypeError(SpecimapError, ValueError):
     code = "media_type_unsupported"
 
 
+class ChecksumInvalidError(SpecimapError, ValueError):
+    """Upload-Checksum names an algorithm that is not served, or its digest does not read."""
+
+    code = "checksum_invalid"
+
+
 class RequestTimeoutError(SpecimapError, TimeoutError):
     """The rest of a request did not arrive in time; ``details['seconds']`` says how long the service waits."""
 

@@ -47,6 +47,7 @@ HTTP_STATUS: dict[type[SpecimapError], int] = {
     infra.StageTimeoutError: 500,
     infra.StorageUnavailableError: 503,
     infra.WorkerCrashedError: 500,
+    service.ChecksumInvalidError: 400,
     service.ChecksumMismatchError: 460,
     service.ForbiddenError: 403,
     service.IdempotencyConflictError: 409,

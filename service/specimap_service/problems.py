@@ -21,6 +21,8 @@ from specimap_service.http_status import error_class, status_of
 
 MEDIA_TYPE = "application/problem+json"
 CLIENT_CLOSED = 499
+ADVICE = {409: "Ask for the offset with HEAD, and continue from there."}
+"""For statuses that the tus library answers with."""
 
 
 class Problem(BaseModel):
@@ -106,7 +108,7 @@ def add_handlers(app: FastAPI) -> None:
     async def _http(request: Request, error: HTTPException) -> JSONResponse:
         leaf = error_class(error.status_code)
         return problem_response(
-            leaf(str(error.detail) + ".", advice="/docs shows what there is."),
+            leaf(str(error.detail) + ".", advice=ADVICE.get(error.status_code, "/docs shows what there is.")),
             error.status_code,
             **(dict(error.headers) if error.headers else {}),
         )

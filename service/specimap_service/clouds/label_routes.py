@@ -22,7 +22,6 @@ from specimap_core.atomic import disk_errors, remove
 from specimap_core.cloud.shards import PointArray
 from specimap_infra.labels import current_labels
 from specimap_infra.tables import LabelVersion
-from specimap_service.acquisitions.capacity import DISK_EVERY, check_disks
 from specimap_service.array_responses import (
     ARROW,
     JSON,
@@ -49,6 +48,7 @@ from specimap_service.clouds.label_store import Conditions, check_room, delete_l
 from specimap_service.clouds.open_clouds import LabelRecord, OpenClouds
 from specimap_service.context import AppContext, Context
 from specimap_service.errors import MediaTypeError, PayloadTooLargeError
+from specimap_service.space import DISK_EVERY, check_disks
 
 router = APIRouter(prefix="/v1", tags=["labels"])
 CloudId = Annotated[str, Path(pattern=r"^cloud_[0-9a-z]{26}$")]

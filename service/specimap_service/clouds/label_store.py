@@ -22,12 +22,12 @@ from specimap_infra.errors import DatabaseUnavailableError
 from specimap_infra.labels import lock_cloud
 from specimap_infra.storage import Storage
 from specimap_infra.tables import LabelVersion
-from specimap_service.acquisitions.capacity import check_disks, check_quota, over_quota, quota_left
 from specimap_service.auth.keys import Principal
 from specimap_service.clouds.label_body import LabelMetadata
 from specimap_service.clouds.open_clouds import OpenClouds
 from specimap_service.context import AppContext, audit
 from specimap_service.errors import PreconditionFailedError, RequestInvalidError
+from specimap_service.space import check_disks, check_quota, over_quota, quota_left
 
 _TAG = re.compile(r'^(W/)?(?:"(\d{1,9})"|(\d{1,9}))$')
 

@@ -10,13 +10,10 @@ from fastapi import APIRouter, Request
 from specimap_infra.ids import new_id
 from specimap_infra.tables import Acquisition
 from specimap_service.acquisitions.capacity import (
-    DISK_EVERY,
     check_count,
-    check_disks,
     check_size,
     max_file_bytes,
     no_acquisition,
-    quota_left,
 )
 from specimap_service.acquisitions.inspection import Arrival
 from specimap_service.acquisitions.intake import clean_name, take_in
@@ -25,6 +22,7 @@ from specimap_service.auth.dependencies import Uploader
 from specimap_service.auth.keys import Principal
 from specimap_service.context import AppContext, Context
 from specimap_service.errors import QuotaExceededError, RequestInvalidError
+from specimap_service.space import DISK_EVERY, check_disks, quota_left
 from specimap_service.uploads.dependencies import UploadsDep
 from specimap_service.uploads.lifecycle import Uploads
 from specimap_service.uploads.multipart import FormFiles, Part
