@@ -108,7 +108,7 @@ class Connection(HttpToolsProtocol):
         error = TooManyConnectionsError(
             "There are too many connections.", advice=f"Try again in {RETRY_SECONDS} s.", retry_after_s=RETRY_SECONDS
         )
-        self._write(problem_response(error, **{"Retry-After": str(RETRY_SECONDS)}))
+        self._write(problem_response(error, None, **{"Retry-After": str(RETRY_SECONDS)}))
         # A connection closed with unread bytes is reset, and the client may not see the answer: it ends it itself.
         self.transport.write_eof()
         self._timer = self.loop.call_later(REFUSED_SECONDS, self.transport.abort)

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -99,7 +100,7 @@ def test_a_body_may_come_in_any_pieces(shared: Running) -> None:
         assert answered(connection).count(b"HTTP/1.1 200 ") == 2
 
 
-QUICK = {"head_seconds": 0.3, "keep_alive_seconds": 0.3, "silence_seconds": 0.4}
+QUICK: dict[str, Any] = {"head_seconds": 0.3, "keep_alive_seconds": 0.3, "silence_seconds": 0.4}
 ASKED = b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n"
 PIPELINED = b"GET /openapi.json HTTP/1.1\r\nHost: x\r\n\r\n"
 UNENDED: dict[str, tuple[bytes, ...]] = {
