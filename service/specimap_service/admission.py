@@ -13,7 +13,7 @@ FILES_PER_CONNECTION = 2
 OTHER_FILES = 256
 """Open files apart from connections: the database, the queue, clouds, judging."""
 REFUSED_TOGETHER = 64
-"""Connections that are told at the same time that there are too many; further ones are only closed."""
+"""Refused connections that are kept for a moment, so that the client surely sees why; further ones are closed."""
 
 
 class Client(Protocol):

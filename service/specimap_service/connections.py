@@ -97,18 +97,18 @@ class Connection(HttpToolsProtocol):
         super().connection_lost(exc)
 
     def give_way(self) -> None:
-        """Close a connection that waits for a request."""
+        """Close a connection without a request under way."""
         self.transport.close()
 
     def _refuse(self) -> None:
         self._refused = True
-        if not self.admission.may_be_told(self):
-            self.transport.abort()
-            return
         error = TooManyConnectionsError(
             "There are too many connections.", advice=f"Try again in {RETRY_SECONDS} s.", retry_after_s=RETRY_SECONDS
         )
         self._write(problem_response(error, None, **{"Retry-After": str(RETRY_SECONDS)}))
+        if not self.admission.may_be_told(self):
+            self.transport.close()
+            return
         # A connection closed with unread bytes is reset, and the client may not see the answer: it ends it itself.
         self.transport.write_eof()
         self._timer = self.loop.call_later(REFUSED_SECONDS, self.transport.abort)
@@ -164,7 +164,8 @@ class Connection(HttpToolsProtocol):
         """Wait for the next request, unless it has come already."""
         self._steps += 1
         super().on_response_complete()
-        self.admission.set_waiting(self, not (self._busy or self._in_body))
+        # Also where the rest of a body is still to come: nobody waits for it any more.
+        self.admission.set_waiting(self, not self._busy)
 
     def resume_writing(self) -> None:
         """Go on with an answer of which enough has been read."""

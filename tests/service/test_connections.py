@@ -301,12 +301,24 @@ def test_one_address_leaves_places_to_others(tmp_path: Path) -> None:
             connection.close()
 
 
-def test_who_asks_nothing_keeps_nobody_out(tmp_path: Path) -> None:
+HELD = {
+    "nothing": b"",
+    "half a head": b"GET /healthz HTTP/1.1\r\nX:",
+    "an answer": ASKED,
+    "half a body without a key": b"POST /v1/jobs HTTP/1.1\r\nHost: x\r\nContent-Length: 9\r\n\r\n1",
+}
+
+
+@pytest.mark.parametrize("what", HELD)
+def test_who_asks_nothing_keeps_nobody_out(tmp_path: Path, what: str) -> None:
     with serving(tmp_path, max_connections=20, max_connections_per_address=20) as service:
-        held = [connected(service) for _ in range(60)]
-        for connection in held[1::2]:
-            with suppress(ConnectionError):
-                connection.sendall(b"GET /healthz HTTP/1.1\r\nX:")
+        held = []
+        for _ in range(30):
+            held.append(connected(service))
+            held[-1].sendall(HELD[what])
+            if b"\r\n\r\n" in HELD[what]:
+                assert held[-1].recv(65536).startswith(b"HTTP/1.1 ")
+                until(lambda: not service.server.server_state.tasks)
         with httpx.Client(trust_env=False) as client:
             assert client.get(f"{service.url}/healthz").status_code == 200
         for connection in held:
