@@ -44,7 +44,7 @@ FEATURE_IMPORTS = {
     "uploads": {"auth", "acquisitions"},  # an upload becomes a file of an acquisition
 }
 """Features of the service, and which others each may import."""
-SHARED_IMPORTS = {"health": {"auth"}, "body_limits": {"auth"}, "app": set(FEATURE_IMPORTS)}
+SHARED_IMPORTS = {"health": {"auth"}, "body_limits": {"auth"}, "space": {"auth"}, "app": set(FEATURE_IMPORTS)}
 """Modules next to the features that may import some; all others import none."""
 HEAVY = ("cv2", "open3d", "pycolmap", "embreex", "scipy", "torch")
 LIGHT = (

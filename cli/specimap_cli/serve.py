@@ -34,13 +34,14 @@ def serve(*, workers: bool, say: Callable[[str], None]) -> None:
     import uvicorn
 
     from specimap_service.app import create_app
-    from specimap_service.connections import Connection
+    from specimap_service.server import notice_dead_peers, server_config
 
     settings = load_settings()
     set_up_logs(settings)
     check_confinement(settings)
     hide_from_others()
     listener = _listen(settings)
+    notice_dead_peers(listener, settings.silence_seconds)
     database = Database.open(settings.database)
     try:
         migrate(database)
@@ -64,24 +65,12 @@ def serve(*, workers: bool, say: Callable[[str], None]) -> None:
                 say("First start. This is the administrator's key; it is shown this once and kept nowhere:")
                 say(key)
 
-    config = uvicorn.Config(
-        app,
-        log_config=None,
-        access_log=False,
-        ws="none",
-        lifespan="on",
-        proxy_headers=False,
-        server_header=False,
-        timeout_graceful_shutdown=5,
-        timeout_keep_alive=75,
-        http=Connection,
-    )
     # The server raises the signal that stopped it again at its end, when the workers have still to be stopped.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: None)
     supervisor.start()
     try:
-        Server(config).run(sockets=[listener])
+        Server(server_config(app, settings)).run(sockets=[listener])
     finally:
         supervisor.stop()
 

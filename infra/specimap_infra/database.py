@@ -14,6 +14,7 @@ from sqlalchemy.orm import Session, sessionmaker
 
 from specimap_core.atomic import disk_errors
 from specimap_infra.errors import DatabaseUnavailableError
+from specimap_infra.private_files import make_private
 
 CONNECT_SECONDS = 5
 
@@ -26,6 +27,7 @@ def make_engine(url: str, *, pool_size: int = 10) -> sa.Engine:
             path = Path(parsed.database)
             with disk_errors(path.parent):
                 path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+                make_private(path)
         engine = sa.create_engine(parsed, pool_size=pool_size, max_overflow=20)
 
         @event.listens_for(engine, "connect")

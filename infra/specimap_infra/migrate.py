@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import fcntl
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import sqlalchemy as sa
@@ -73,7 +75,9 @@ def exclusive_lock(engine: sa.Engine) -> Iterator[None]:
         if not file:
             yield
             return
-        with open(Path(file).with_suffix(".lock"), "w", encoding="ascii") as lock:
+        # Who may open it could hold it.
+        private = partial(os.open, mode=0o600)
+        with open(Path(file).with_suffix(".lock"), "w", encoding="ascii", opener=private) as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             yield
         return

@@ -65,6 +65,28 @@ class ServiceSettings(BaseSettings):
     rate_per_minute: int = Field(
         default=6000, ge=1, description="Requests a minute that a key may make, unless the key says otherwise."
     )
+    max_connections: int = Field(
+        default=1000, ge=1, description="Connections that the API takes at a time; it raises its limit of open files."
+    )
+    max_connections_per_address: int = Field(
+        default=900,
+        ge=1,
+        description="Connections of one address; a proxy has one address, and what is left serves health checks.",
+    )
+    max_streams_per_key: int = Field(
+        default=100, ge=1, description="Streams of job events that one key may follow at a time, in each API process."
+    )
+    head_seconds: float = Field(default=30, gt=0, description="Longest time that the head of a request may take.")
+    keep_alive_seconds: float = Field(
+        default=75,
+        gt=0,
+        description="How long a connection may wait for its next request; longer than a proxy keeps its own.",
+    )
+    silence_seconds: float = Field(
+        default=60,
+        gt=0,
+        description="Silence in a body, or in the reading of an answer, after which a connection is closed.",
+    )
 
     max_photo_bytes: int = Field(default=64 * MIB, ge=1, description="Largest photo.")
     max_cube_bytes: int = Field(default=8 * GIB, ge=1, description="Largest cube file.")
@@ -72,12 +94,12 @@ class ServiceSettings(BaseSettings):
     quota_bytes: int = Field(
         default=200 * GIB,
         ge=1,
-        description="Bytes that the acquisitions of one key may hold, unless the key says otherwise.",
+        description="Bytes that the acquisitions and labels of one key may hold, unless the key says otherwise.",
     )
     min_free_bytes: int = Field(
         default=2 * GIB,
         ge=0,
-        description="Free space below which new uploads are refused, so that running jobs can finish.",
+        description="Free space below which new uploads and labels are refused, so that running jobs can finish.",
     )
     upload_hours: float = Field(default=48, gt=0, description="Hours after which an unfinished upload is dropped.")
     judge_seconds: float = Field(default=60, gt=0, description="Longest time that the judging of one file may take.")

@@ -234,6 +234,8 @@ class LabelVersion(Base):
     made_by: Mapped[dict[str, Any]]
     storage_prefix: Mapped[str]
     sha256: Mapped[str]
+    size: Mapped[int] = mapped_column(sa.BigInteger, default=0, server_default=sa.text("0"))
+    """Stored bytes; 0 for versions older than the column, which no quota counts."""
     created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now)
     created_by: Mapped[str]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 from fastapi_offline import FastAPIOffline
 from starlette.middleware.cors import CORSMiddleware
 
@@ -24,9 +24,11 @@ from specimap_service.clouds import export_routes, label_routes, preview_routes,
 from specimap_service.clouds import routes as cloud_routes
 from specimap_service.clouds.spectra import SpectraRequest
 from specimap_service.context import CONTEXT, AppContext
+from specimap_service.head_requests import HeadRequests
 from specimap_service.jobs import dependencies as jobs
 from specimap_service.jobs import routes as job_routes
 from specimap_service.middleware import RequestObserver
+from specimap_service.query_parameters import check_query
 from specimap_service.uploads import dependencies as uploads
 from specimap_service.uploads import form_routes, tus_routes
 from specimap_service.uploads import routes as upload_routes
@@ -34,7 +36,8 @@ from specimap_service.uploads import routes as upload_routes
 DESCRIPTION = """\
 Photos and one hyperspectral cube of an excised specimen to a metric 3D point cloud in which every point carries its
 spectrum. Every call but `/healthz` and `/readyz` takes a key: `Authorization: Bearer spk_…`. Errors are
-`application/problem+json` with a stable code and advice. Within `/v1` the contract only grows.
+`application/problem+json` with a stable code and advice. HEAD works wherever GET does. A query parameter that an
+operation does not know is refused. Within `/v1` the contract only grows.
 """
 
 FEATURES = (auth.FEATURE, acquisitions.FEATURE, uploads.FEATURE, jobs.FEATURE, clouds.FEATURE)
@@ -81,6 +84,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         description=DESCRIPTION,
         license_info={"name": "Apache-2.0", "identifier": "Apache-2.0"},
         responses=problems.RESPONSES,
+        dependencies=[Depends(check_query)],
         redirect_slashes=False,
         lifespan=lifespan,
         separate_input_output_schemas=False,
@@ -94,6 +98,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         app.include_router(routes.router)
     # The last one added sees a request first: the limits come after CORS and the corrections of uploads, and before
     # everything that reads a body.
+    app.add_middleware(HeadRequests)
     app.add_middleware(BodyLimits)
     tus_routes.mount(app)
     if settings.cors_origins:

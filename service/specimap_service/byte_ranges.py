@@ -20,6 +20,7 @@ from specimap_core.errors import NotFoundError
 from specimap_infra.errors import StorageUnavailableError
 from specimap_infra.storage import Storage
 from specimap_service.errors import PreconditionFailedError, RangeNotSatisfiableError
+from specimap_service.head_requests import only_head
 from specimap_service.problems import problem_response
 
 PIECE = 1024 * 1024
@@ -67,6 +68,12 @@ def known_to_client(request: Request, etag: str) -> bool:
     return known is not None and _matches(known, etag, weakly=True)
 
 
+def names_tag(request: Request, etag: str) -> bool:
+    """Return whether If-None-Match holds the quoted ETag itself; `*` needs to be known to exist first."""
+    known = request.headers.get("if-none-match", "")
+    return known.strip() != "*" and _matches(known, etag, weakly=True)
+
+
 def _answer(request: Request, source: _Source, media_type: str, filename: str | None, cache: str) -> Response:
     etag = f'"{source.etag}"'
     headers = {"ETag": etag, "Cache-Control": cache, "Accept-Ranges": "bytes", "Vary": "Authorization"}
@@ -86,7 +93,7 @@ def _answer(request: Request, source: _Source, media_type: str, filename: str | 
     start, stop, status = 0, source.size, 200
     wanted_range = asked.get("range")
     # Ranges are defined for GET only; If-Range says: the range if the file is still this one, else all of it.
-    if wanted_range is not None and request.method == "GET" and asked.get("if-range", etag) == etag:
+    if wanted_range is not None and not only_head(request) and asked.get("if-range", etag) == etag:
         try:
             found = _parsed(wanted_range, source.size)
         except RangeNotSatisfiableError as error:
@@ -95,7 +102,7 @@ def _answer(request: Request, source: _Source, media_type: str, filename: str | 
             start, stop, status = *found, 206
             headers["Content-Range"] = f"bytes {start}-{stop - 1}/{source.size}"
     headers["Content-Length"] = str(stop - start)
-    if request.method == "HEAD":
+    if only_head(request):
         return Response(None, status, headers, media_type)
     if stop - start <= PIECE:
         # This runs in a thread already: a small file needs no other.

@@ -105,3 +105,21 @@ class MediaTypeError(SpecimapError, ValueError):
     """The body is of a media type that the operation does not take; ``details['offered']`` lists those it does."""
 
     code = "media_type_unsupported"
+
+
+class ChecksumInvalidError(SpecimapError, ValueError):
+    """Upload-Checksum names an algorithm that is not served, or its digest does not read."""
+
+    code = "checksum_invalid"
+
+
+class RequestTimeoutError(SpecimapError, TimeoutError):
+    """The rest of a request did not arrive in time; ``details['seconds']`` says how long the service waits."""
+
+    code = "request_timeout"
+
+
+class TooManyConnectionsError(SpecimapError, RuntimeError):
+    """The service has as many connections as it takes; try again after ``details['retry_after_s']`` seconds."""
+
+    code = "too_many_connections"

@@ -12,7 +12,7 @@ from prometheus_client.registry import Collector
 from specimap_infra.database import Database, utc_now
 from specimap_infra.errors import DatabaseUnavailableError, StorageUnavailableError
 from specimap_infra.storage import Storage
-from specimap_infra.tables import JOB_STATES, Artefact, CloudRow, Job, Lease, StoredFile
+from specimap_infra.tables import JOB_STATES, Artefact, CloudRow, Job, LabelVersion, Lease, StoredFile
 
 REQUEST_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 60)
 
@@ -99,6 +99,7 @@ class _FromDatabase(Collector):
                 "files": session.scalar(sa.select(sa.func.sum(StoredFile.size))),
                 "artefacts": session.scalar(sa.select(sa.func.sum(Artefact.size))),
                 "clouds": session.scalar(sa.select(sa.func.sum(CloudRow.size))),
+                "labels": session.scalar(sa.select(sa.func.sum(LabelVersion.size))),
             }
         stored = GaugeMetricFamily("specimap_storage_use_bytes", "Stored bytes by kind.", labels=("kind",))
         for kind, size in sizes.items():

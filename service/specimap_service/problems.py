@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from fastapi import FastAPI, Request
+from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 from pydantic.json_schema import models_json_schema
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from specimap_core.errors import SpecimapError
 from specimap_infra.logs import logger
@@ -19,6 +20,9 @@ from specimap_service.errors import RateLimitedError, RequestInvalidError, Unaut
 from specimap_service.http_status import error_class, status_of
 
 MEDIA_TYPE = "application/problem+json"
+CLIENT_CLOSED = 499
+ADVICE = {409: "Ask for the offset with HEAD, and continue from there."}
+"""For statuses that the tus library answers with."""
 
 
 class Problem(BaseModel):
@@ -95,11 +99,16 @@ def add_handlers(app: FastAPI) -> None:
             )
         )
 
+    @app.exception_handler(ClientDisconnect)
+    async def _gone(request: Request, error: ClientDisconnect) -> Response:
+        # Read by nobody; the log shows the status, which is the usual one for this, instead of a failure.
+        return Response(status_code=CLIENT_CLOSED)
+
     @app.exception_handler(HTTPException)
     async def _http(request: Request, error: HTTPException) -> JSONResponse:
         leaf = error_class(error.status_code)
         return problem_response(
-            leaf(str(error.detail) + ".", advice="/docs shows what there is."),
+            leaf(str(error.detail) + ".", advice=ADVICE.get(error.status_code, "/docs shows what there is.")),
             error.status_code,
             **(dict(error.headers) if error.headers else {}),
         )

@@ -1,17 +1,22 @@
-"""What a connection may bring before a key is asked for: a head of bounded size, in bounded time."""
+"""What a connection may bring before a key is asked for, how long it may take, and how many there may be."""
 
 from __future__ import annotations
 
+import asyncio
 import socket
+import subprocess
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
 
-from specimap_service import connections
 from specimap_service.connections import LARGEST_HEAD
+from tests.support.result_scene import put_result
 from tests.support.service_scene import Running, serving
 
 PIECE = b"a" * 16384
@@ -95,13 +100,288 @@ def test_a_body_may_come_in_any_pieces(shared: Running) -> None:
         assert answered(connection).count(b"HTTP/1.1 200 ") == 2
 
 
-@pytest.mark.parametrize(
-    "sent", [b"", b"GET /healthz HTTP/1.1\r\nHost", b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\nGET /"]
-)
-def test_a_head_that_does_not_end_is_not_waited_for(
-    sent: bytes, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+QUICK: dict[str, Any] = {"head_seconds": 0.3, "keep_alive_seconds": 0.3, "silence_seconds": 0.4}
+ASKED = b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n"
+PIPELINED = b"GET /openapi.json HTTP/1.1\r\nHost: x\r\n\r\n"
+UNENDED: dict[str, tuple[bytes, ...]] = {
+    "nothing": (b"",),
+    "half a head": (b"GET /healthz HTTP/1.1\r\nHost",),
+    "half of the second head": (ASKED + b"GET /",),
+    "nothing after an answer": (ASKED,),
+    "half a head after an answer": (ASKED, b"GET /"),
+    "empty lines": (ASKED, b"\r\n"),
+    "no body": (b"GET /healthz HTTP/1.1\r\nHost: x\r\nContent-Length: 9\r\n\r\n",),
+    "half a body after the answer": (b"GET /healthz HTTP/1.1\r\nHost: x\r\nContent-Length: 9\r\n\r\n", b"1"),
+    "half a body without a key": (b"POST /v1/jobs HTTP/1.1\r\nHost: x\r\nContent-Length: 9\r\n\r\n", b"1"),
+}
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    with serving(tmp_path_factory.mktemp("quick"), **QUICK) as running:
+        yield running
+
+
+@pytest.mark.parametrize("what", UNENDED)
+def test_no_client_is_waited_for_without_end(quick: Running, what: str) -> None:
+    pieces = UNENDED[what]
+    with connected(quick) as connection:
+        output = b""
+        for piece in pieces:
+            connection.sendall(piece)
+            if piece is not pieces[-1]:
+                output += connection.recv(65536)
+        output += answered(connection)
+    assert output.count(b"HTTP/1.1 200 ") == b"".join(pieces).count(b"GET /healthz HTTP/1.1\r\nHost: x\r\n")
+
+
+def test_a_head_that_trickles_is_not_waited_for(quick: Running) -> None:
+    with connected(quick) as connection:
+        connection.sendall(b"GET /healthz HTTP/1.1\r\nX: ")
+        sent = 0
+        with suppress(ConnectionError):
+            while sent < 200:
+                sent += connection.send(b"a")
+                time.sleep(0.05)
+    assert sent < 200
+
+
+@pytest.mark.parametrize("path", ["/v1/acquisitions", "/v1/acquisitions/{}/files"])
+@pytest.mark.parametrize("trickles", [False, True])
+def test_a_body_that_stops_is_refused_quietly(
+    quick: Running, path: str, trickles: bool, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(connections, "HEAD_SECONDS", 0.2)
-    with serving(tmp_path) as service, connected(service) as connection:
-        connection.sendall(sent)
-        assert answered(connection).count(b"HTTP/1.1 200 ") == sent.count(b"\r\n\r\n")
+    client = quick.client()
+    acquisition = client.post("/v1/acquisitions", json={"specimen_id": "S"}).json()["id"]
+    key = client.headers["Authorization"]
+    head = (
+        f"POST {path.format(acquisition)} HTTP/1.1\r\nHost: x\r\nAuthorization: {key}\r\n"
+        "Content-Type: multipart/form-data; boundary=x\r\nContent-Length: 9000\r\n\r\n--x\r\n"
+    )
+    with connected(quick) as connection:
+        connection.sendall(head.encode())
+        if trickles:
+            with suppress(ConnectionError):
+                for _ in range(20):
+                    connection.sendall(b"a")
+                    time.sleep(0.05)
+        output = answered(connection)
+    assert output.startswith(b"HTTP/1.1 408 ") or trickles
+    if not trickles:
+        assert b'"code":"request_timeout"' in output
+        assert b"connection: close" in output
+    assert "Traceback" not in capfd.readouterr().err
+
+
+CUT = {
+    "JSON": ("POST", "/v1/acquisitions", "Content-Type: application/json"),
+    "selection": ("POST", "/v1/clouds/{cloud}/spectra", "Content-Type: application/json"),
+    "form": ("POST", "/v1/acquisitions/{acquisition}/files", "Content-Type: multipart/form-data; boundary=x"),
+    "labels": ("PUT", "/v1/clouds/{cloud}/labels/x", 'Content-Type: application/x-npy\r\nX-Specimap-Label: {{"kind": '
+    '"probability", "made_by": {{"name": "x"}}}}'),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", CUT)
+def test_a_client_that_goes_away_is_no_failure(
+    shared: Running, tmp_path: Path, what: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    client = shared.client()
+    acquisition = client.post("/v1/acquisitions", json={"specimen_id": "S"}).json()["id"]
+    cloud = put_result(shared, tmp_path / "result").cloud_id if "cloud" in CUT[what][1] else ""
+    method, path, headers = (text.format(acquisition=acquisition, cloud=cloud) for text in CUT[what])
+    key = client.headers["Authorization"]
+    before = set(shared.settings.scratch.rglob("*"))
+    with connected(shared) as connection:
+        connection.sendall(
+            f"{method} {path} HTTP/1.1\r\nHost: x\r\nAuthorization: {key}\r\n{headers}\r\n"
+            "Content-Length: 9000\r\n\r\n--x\r\n".encode()
+        )
+        until(lambda: bool(shared.server.server_state.tasks))
+        time.sleep(0.1)
+    until(lambda: not shared.server.server_state.tasks)
+    assert capfd.readouterr() == ("", "")
+    assert "500" not in "".join(line for line in client.get("/metrics").text.splitlines() if 'status="5' in line)
+    assert set(shared.settings.scratch.rglob("*")) == before
+
+
+def test_a_body_that_goes_on_takes_as_long_as_it_takes(quick: Running) -> None:
+    key = quick.client().headers["Authorization"]
+    body = b'{"specimen_id": "S", "notes": "' + b"n" * 1500 + b'"' + b" " * 12_000 + b"}"
+    head = f"POST /v1/acquisitions HTTP/1.1\r\nHost: x\r\nAuthorization: {key}\r\nContent-Type: application/json\r\n"
+    with connected(quick) as connection:
+        connection.sendall(head.encode() + b"Connection: close\r\nContent-Length: %d\r\n\r\n" % len(body))
+        for start in range(0, len(body), 1200):
+            connection.sendall(body[start : start + 1200])
+            time.sleep(0.1)
+        assert answered(connection).startswith(b"HTTP/1.1 201 ")
+
+
+@pytest.mark.parametrize("trickles", [False, True])
+def test_an_answer_that_nobody_reads_is_given_up(quick: Running, trickles: bool) -> None:
+    """The answers are more than the buffers of the system hold."""
+    with connected(quick) as connection:
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        with suppress(ConnectionError):
+            connection.settimeout(0.2)
+            for _ in range(100):
+                try:
+                    connection.sendall(PIPELINED)
+                except TimeoutError:
+                    break
+        deadline = time.monotonic() + 15
+        while quick.connections:
+            assert time.monotonic() < deadline, "the connection lives on"
+            if trickles:
+                with suppress(OSError):
+                    connection.recv(1)
+            time.sleep(0.05)
+
+
+def test_long_work_is_not_cut_off(tmp_path: Path) -> None:
+    """Nothing is owed by a client that waits for its answer."""
+    with serving(tmp_path, **QUICK) as service:
+
+        @service.app.get("/long")
+        async def long() -> str:
+            await asyncio.sleep(1.5)
+            return "done"
+
+        with connected(service) as connection:
+            connection.sendall(b"GET /long HTTP/1.1\r\nHost: x\r\n\r\n")
+            assert connection.recv(65536).endswith(b'"done"')
+
+
+def until(condition: Callable[[], bool], seconds: float = 15) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it did not come about"
+        time.sleep(0.02)
+
+
+# ---- how many ------------------------------------------------------------------------------------------
+
+
+LONG = b"POST /v1/jobs HTTP/1.1\r\nHost: x\r\nAuthorization: %s\r\nContent-Length: 9\r\n\r\n"
+
+
+def busy(service: Running, number: int) -> list[socket.socket]:
+    """Connections with a request under way."""
+    key = service.client().headers["Authorization"].encode()
+    made = [connected(service) for _ in range(number)]
+    for connection in made:
+        connection.sendall(LONG % key)
+    return made
+
+
+def test_one_connection_too_many_is_told_so(tmp_path: Path) -> None:
+    with serving(tmp_path, max_connections=20, max_connections_per_address=20) as service:
+        held = busy(service, 20)
+        until(lambda: len(service.server.server_state.tasks) == 20)
+        # httpx has sent its request by the time that it reads the refusal.
+        answer = httpx.get(f"{service.url}/healthz", trust_env=False)
+        assert (answer.status_code, answer.json()["code"]) == (503, "too_many_connections")
+        assert answer.headers["retry-after"] == "5"
+        assert answer.headers["connection"] == "close"
+        for connection in held:
+            connection.close()
+        until(lambda: not service.connections)
+        assert httpx.get(f"{service.url}/healthz", trust_env=False).status_code == 200
+
+
+def test_one_address_leaves_places_to_others(tmp_path: Path) -> None:
+    with serving(tmp_path, max_connections=20, max_connections_per_address=10) as service:
+        held = busy(service, 10)
+        until(lambda: len(service.server.server_state.tasks) == 10)
+        assert httpx.get(f"{service.url}/healthz", trust_env=False).status_code == 503
+        other = httpx.HTTPTransport(local_address="127.0.0.2")
+        with httpx.Client(transport=other) as client:
+            assert client.get(f"{service.url}/healthz").status_code == 200
+        for connection in held:
+            connection.close()
+
+
+HELD = {
+    "nothing": b"",
+    "half a head": b"GET /healthz HTTP/1.1\r\nX:",
+    "an answer": ASKED,
+    "half a body without a key": b"POST /v1/jobs HTTP/1.1\r\nHost: x\r\nContent-Length: 9\r\n\r\n1",
+}
+
+
+@pytest.mark.parametrize("what", HELD)
+def test_who_asks_nothing_keeps_nobody_out(tmp_path: Path, what: str) -> None:
+    with serving(tmp_path, max_connections=20, max_connections_per_address=20) as service:
+        held = []
+        for _ in range(30):
+            held.append(connected(service))
+            held[-1].sendall(HELD[what])
+            if b"\r\n\r\n" in HELD[what]:
+                assert held[-1].recv(65536).startswith(b"HTTP/1.1 ")
+                until(lambda: not service.server.server_state.tasks)
+        with httpx.Client(trust_env=False) as client:
+            assert client.get(f"{service.url}/healthz").status_code == 200
+        for connection in held:
+            connection.close()
+
+
+STARVED = """
+import resource, socket, sys
+import uvicorn
+from specimap_infra.logs import set_up_logs
+from specimap_infra.settings import load_settings
+from specimap_service.admission import Admission
+from specimap_service.app import create_app
+from specimap_service.server import server_config
+
+resource.setrlimit(resource.RLIMIT_NOFILE, (int(sys.argv[2]), int(sys.argv[2])))
+most = int(sys.argv[3])
+settings = load_settings(
+    data_dir=sys.argv[1], log_level="error", max_connections=most, max_connections_per_address=most
+)
+set_up_logs(settings)
+listening = socket.create_server(("127.0.0.1", 0))
+config = server_config(create_app(settings), settings)
+if len(sys.argv) > 4:
+    config.http.admission = Admission(1000, 1000)
+print(listening.getsockname()[1], flush=True)
+uvicorn.Server(config).run(sockets=[listening])
+"""
+
+
+@contextmanager
+def starved(folder: Path, *arguments: object) -> Iterator[str]:
+    """A service in a process of its own that may open few files."""
+    program = [sys.executable, "-c", STARVED, str(folder), *map(str, arguments)]
+    with subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            url = f"http://127.0.0.1:{process.stdout.readline().strip()}"
+            until(lambda: up(url))
+            yield url
+        finally:
+            process.terminate()
+            process.communicate(timeout=20)
+
+
+def up(url: str) -> bool:
+    with suppress(httpx.TransportError):
+        return httpx.get(f"{url}/healthz", trust_env=False, timeout=5).status_code == 200
+    return False
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("unlimited", [False, True], ids=["limited", "out of files"])
+def test_the_limit_of_open_files_stops_nothing(tmp_path: Path, unlimited: bool) -> None:
+    """More connections than files: they are refused; and where the files run out all the same, the service goes on."""
+    with starved(tmp_path, 320, 1000, *["unlimited"] * unlimited) as url:
+        port = httpx.URL(url).port or 0
+        held = []
+        for _ in range(500):
+            with suppress(OSError):
+                held.append(socket.create_connection(("127.0.0.1", port), timeout=5))
+        if not unlimited:
+            assert up(url)
+        for connection in held:
+            connection.close()
+        until(lambda: up(url), 10)

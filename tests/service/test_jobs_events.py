@@ -17,7 +17,9 @@ import sqlalchemy as sa
 from psycopg import sql
 
 from specimap_infra import jobs
-from specimap_infra.database import Database
+from specimap_infra.database import Database, utc_now
+from specimap_infra.tables import ApiKey, Job
+from specimap_service.auth import keys
 from specimap_service.jobs import events
 from tests.support.databases import postgres_server, postgres_url
 from tests.support.job_scene import EXECUTOR, acquisition, queued_job
@@ -106,6 +108,73 @@ def test_stream_is_resumed_after_the_last_event_seen(service: Running) -> None:
     assert len(list(parsed(iter(client.get(path, params={"after": 61}).text.splitlines())))) == 2
     assert client.get(path, headers={"Last-Event-ID": "x"}).status_code == 422
     assert client.get(f"/v1/jobs/job_{'0' * 26}/events").status_code == 404
+
+
+def test_a_number_beyond_the_last_event_delays_nobody(service: Running) -> None:
+    """Neither the listener that gives it, first of all, nor those that come after."""
+    job_id = queued_job(service.database)
+    client = service.client(["read"])
+    with following(client, job_id, {"Last-Event-ID": "999999999"}) as beyond, following(client, job_id) as described:
+        assert next(described)[0] == 1
+        work(service.database, job_id, 3)
+        assert [(seq, type) for seq, type, _ in described] == expected(3)[1:]
+        assert [(seq, type) for seq, type, _ in beyond] == expected(3)[1:]
+    again = client.get(f"/v1/jobs/{job_id}/events", headers={"Last-Event-ID": "999999999"})
+    assert again.status_code == 204
+
+
+def test_listener_after_the_end_is_told_so_whatever_it_has_seen(service: Running) -> None:
+    """A job may end between the look at its events and the look at its state."""
+    job_id = queued_job(service.database)
+    work(service.database, job_id, 1)
+    with service.database.session() as session:
+        job = session.get_one(Job, job_id)
+        assert events.position(session, job, 0) == 0
+        assert events.position(session, job, 3) == 3
+        assert events.position(session, job, 4) is None
+        assert events.position(session, job, 10**9) is None
+
+
+@pytest.mark.parametrize("how", ["revoked", "revoked elsewhere", "expired"])
+def test_stream_ends_with_its_key(service: Running, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(keys, "KEPT_SECONDS", 0.3)
+    admin, client = service.client(), service.client(["read"])
+    key_id = f"key_{client.headers['authorization'].split('_')[1]}"
+    job_id = queued_job(service.database)
+    with following(client, job_id) as described, following(admin, job_id) as other:
+        assert next(described)[0] == next(other)[0] == 1
+        if how == "revoked":
+            assert admin.delete(f"/v1/keys/{key_id}").status_code == 204
+        else:
+            change = {"revoked_at": utc_now()} if how == "revoked elsewhere" else {"expires_at": utc_now()}
+            with service.database.session() as session:
+                session.execute(sa.update(ApiKey).where(ApiKey.id == key_id).values(**change))
+        assert list(described) == []
+        assert client.get(f"/v1/jobs/{job_id}/events").status_code == 401
+        work(service.database, job_id, 2)
+        assert [(seq, type) for seq, type, _ in other] == expected(2)[1:]
+
+
+def test_a_key_follows_so_many_streams(tmp_path: Path) -> None:
+    with serving(tmp_path, max_streams_per_key=2) as service:
+        client, other = service.client(["read"]), service.client(["read"])
+        job_id = queued_job(service.database)
+        path = f"/v1/jobs/{job_id}/events"
+        with following(client, job_id) as one, following(client, job_id) as two:
+            assert next(one)[0] == next(two)[0] == 1
+            refused = client.get(path)
+            assert (refused.status_code, refused.json()["code"]) == (429, "rate_limited")
+            assert int(refused.headers["retry-after"]) > 0
+            with following(other, job_id) as third:
+                assert next(third)[0] == 1
+        # Closed streams, ended streams and refused requests give their places back.
+        streams = service.app.state.streams
+        until(lambda: not streams._counts)
+        assert client.get(f"/v1/jobs/job_{'0' * 26}/events").status_code == 404
+        work(service.database, job_id, 1)
+        for _ in range(3):
+            assert client.get(path).status_code == 200
+            until(lambda: not streams._counts)
 
 
 @pytest.mark.slow

@@ -7,7 +7,10 @@ from pathlib import Path
 
 import httpx
 import pytest
+import sqlalchemy as sa
 
+from specimap_infra.database import utc_now
+from specimap_infra.tables import ApiKey
 from specimap_service.auth.rate_limit import RateLimiter
 from specimap_service.errors import RateLimitedError
 from tests.support.service_scene import Running, serving
@@ -52,11 +55,23 @@ def test_wrong_keys_are_refused_alike(service: Running, wrong: str) -> None:
 
 def test_expired_key_is_refused(service: Running) -> None:
     admin = service.client()
-    made = admin.post("/v1/keys", json={"name": "old", "scopes": ["admin"], "expires_at": "2020-01-01T00:00:00Z"})
+    made = admin.post("/v1/keys", json={"name": "old", "scopes": ["admin"], "expires_at": "2100-01-01T00:00:00Z"})
+    with service.database.session() as session:
+        session.execute(sa.update(ApiKey).where(ApiKey.id == made.json()["id"]).values(expires_at=utc_now()))
     answer = httpx.get(
         f"{service.url}/v1/keys", headers={"Authorization": f"Bearer {made.json()['key']}"}, trust_env=False
     )
     assert answer.status_code == 401
+
+
+@pytest.mark.parametrize("past", ["2020-01-01T00:00:00Z", "now"])
+def test_no_key_is_made_that_has_expired(service: Running, past: str) -> None:
+    admin = service.client()
+    asked = {"name": "old", "scopes": ["read"], "expires_at": utc_now().isoformat() if past == "now" else past}
+    answer = admin.post("/v1/keys", json=asked)
+    assert (answer.status_code, answer.json()["code"]) == (422, "request_invalid")
+    assert answer.json()["details"]["fields"][0]["where"] == "body.expires_at"
+    assert [key["name"] for key in admin.get("/v1/keys").json()] == ["test"]
 
 
 def test_too_many_requests_are_told_when_to_come_back(service: Running) -> None:

@@ -217,6 +217,13 @@ def test_etag_spares_the_drawing(service: Running, client: httpx.Client, result:
     assert other.status_code == 200
 
 
+@pytest.mark.parametrize("kind", ["band", "composite", "index", "label"])
+def test_no_client_has_a_picture_that_cannot_be(client: httpx.Client, result: Result, kind: str) -> None:
+    asked = {"band": {"b": "7"}, "composite": {"r": "7"}, "index": {"a": "7", "b": "1"}, "label": {"name": "none"}}
+    answer = client.get(previews(result, kind), params=asked[kind], headers={"If-None-Match": "*"})
+    assert answer.status_code == 404
+
+
 IMPOSSIBLE: list[tuple[str, dict[str, str], int]] = [
     ("band", {}, 422),
     ("band", {"b": "1", "nm": "500"}, 422),

@@ -150,6 +150,16 @@ def test_checksums(service: Running) -> None:
     assert result(client, at)["state"] == "finished"
 
 
+@pytest.mark.parametrize("given", ["crc32 AAAAAA==", "sha512 AAAA", "sha256", "sha256 !", "sha256 AAAA", ""])
+def test_a_checksum_that_is_none_is_refused_before_the_body(service: Running, given: str) -> None:
+    client = service.client()
+    at = created(client, new_acquisition(client), "photo", 100)
+    answer = patch(client, at, b"x" * 10, 0, **{"Upload-Checksum": given})
+    assert (answer.status_code, answer.json()["code"]) == (400, "checksum_invalid")
+    assert "sha256" in answer.json()["advice"]
+    assert offset_of(client, at) == 0
+
+
 def test_ended_upload_is_gone(service: Running) -> None:
     client = service.client()
     acquisition = new_acquisition(client)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import errno
 import hashlib
 import os
@@ -17,7 +18,9 @@ import pytest
 
 from specimap_infra.database import utc_now
 from specimap_infra.tables import Upload
+from specimap_service.auth.keys import Principal
 from specimap_service.uploads import tus_store
+from specimap_service.uploads.lifecycle import Uploads
 from tests.support.service_scene import Running
 from tests.support.upload_scene import (
     OCTETS,
@@ -210,6 +213,59 @@ def test_two_clients_at_once(service: Running, monkeypatch: pytest.MonkeyPatch) 
     first.join(timeout=30)
     assert answers == [204]
     assert result(client, at)["file"]["sha256"] == hashlib.sha256(data).hexdigest()
+
+
+@pytest.mark.parametrize("ask", ["HEAD", "PATCH", "PATCH nothing", "PATCH checked", "DELETE", "result"])
+def test_another_request_finishes_the_upload_meanwhile(
+    service: Running, monkeypatch: pytest.MonkeyPatch, ask: str
+) -> None:
+    """Between the look at its row and the lock of its file."""
+    client, first = service.client(), service.client()
+    at = created(client, new_acquisition(client), "photo", len(PHOTO))
+    look = Uploads.current
+
+    def overtaken(self: Uploads, upload_id: str, principal: Principal) -> Upload:
+        found = look(self, upload_id, principal)
+        monkeypatch.setattr(Uploads, "current", look)
+        assert patch(first, at, PHOTO, 0).status_code == 204
+        return found
+
+    monkeypatch.setattr(Uploads, "current", overtaken)
+    if ask == "HEAD":
+        assert offset_of(client, at) == len(PHOTO)
+    elif ask == "DELETE":
+        assert client.delete(at, headers=TUS).json()["code"] == "state_conflict"
+    elif ask == "result":
+        assert (result(client, at)["state"], result(client, at)["offset"]) == ("finished", len(PHOTO))
+    elif ask == "PATCH nothing":
+        # What a client sends that did not hear the answer to its last byte.
+        answer = patch(client, at, b"", len(PHOTO))
+        assert answer.status_code == 204
+        assert answer.headers["specimap-verdict"] == "accepted"
+    else:
+        digest = base64.b64encode(hashlib.sha256(PHOTO).digest()).decode()
+        checked = {"Upload-Checksum": f"sha256 {digest}"} if ask == "PATCH checked" else {}
+        answer = patch(client, at, PHOTO, 0, **checked)
+        assert (answer.status_code, answer.json()["code"]) == (409, "upload_conflict")
+        assert "HEAD" in answer.json()["advice"]
+    assert offset_of(client, at) == len(PHOTO)
+    assert result(client, at)["state"] == "finished"
+
+
+def test_an_upload_that_is_ended_meanwhile_is_gone(service: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    client, first = service.client(), service.client()
+    at = created(client, new_acquisition(client), "photo", len(PHOTO))
+    look = Uploads.current
+
+    def overtaken(self: Uploads, upload_id: str, principal: Principal) -> Upload:
+        found = look(self, upload_id, principal)
+        monkeypatch.setattr(Uploads, "current", look)
+        assert first.delete(at, headers=TUS).status_code == 204
+        return found
+
+    monkeypatch.setattr(Uploads, "current", overtaken)
+    answer = patch(client, at, PHOTO, 0)
+    assert (answer.status_code, answer.json()["code"]) == (410, "upload_gone")
 
 
 def test_a_dead_connection_gives_way(service: Running, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,7 +29,7 @@ from specimap_service.acquisitions import dependencies
 from specimap_service.acquisitions.judge import Judge
 from specimap_service.app import create_app
 from specimap_service.auth.keys import new_key
-from specimap_service.connections import Connection
+from specimap_service.server import server_config
 from tests.support.databases import create_tables
 
 ALL_SCOPES = ("upload", "read", "label", "intraoperative", "admin")
@@ -42,6 +42,7 @@ class Running:
     url: str
     settings: ServiceSettings
     app: FastAPI
+    server: uvicorn.Server
     clients: list[httpx.Client] = field(default_factory=list)
 
     @property
@@ -49,6 +50,11 @@ class Running:
         """The app's own database object."""
         database: Database = self.app.state.context.database
         return database
+
+    @property
+    def connections(self) -> int:
+        """How many connections are open."""
+        return len(self.server.server_state.connections)
 
     @property
     def storage(self) -> Storage:
@@ -124,11 +130,7 @@ def serving(folder: Path, *, own_judge: bool = False, **given: object) -> Iterat
     database.close()
     with mock.patch.object(dependencies, "Judge", Judge if own_judge else lambda *_: shared_judge()):
         app = create_app(settings)
-    server = uvicorn.Server(
-        uvicorn.Config(
-            app, host="127.0.0.1", port=0, log_config=None, access_log=False, ws="none", lifespan="on", http=Connection
-        )
-    )
+    server = uvicorn.Server(server_config(app, settings, host="127.0.0.1", port=0))
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
     deadline = time.monotonic() + 20
@@ -137,7 +139,7 @@ def serving(folder: Path, *, own_judge: bool = False, **given: object) -> Iterat
         assert time.monotonic() < deadline, "the server did not start"
         time.sleep(0.01)
     port = server.servers[0].sockets[0].getsockname()[1]
-    running = Running(f"http://127.0.0.1:{port}", settings, app)
+    running = Running(f"http://127.0.0.1:{port}", settings, app, server)
     try:
         yield running
     finally:

@@ -34,6 +34,7 @@ from specimap_infra.logs import set_up_logs
 from specimap_infra.projects import DEFAULT_PROJECT
 from specimap_infra.settings import load_settings
 from specimap_service.app import create_app
+from specimap_service.server import server_config
 
 given = json.loads(sys.argv[1])
 limit = given.pop("largest_file", 0)
@@ -44,7 +45,7 @@ if limit:
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 listening = socket.create_server(("127.0.0.1", 0))
 print(listening.getsockname()[1], flush=True)
-uvicorn.run(app, fd=listening.fileno(), log_level="warning", access_log=False, ws="none")
+uvicorn.Server(server_config(app, settings)).run(sockets=[listening])
 """
 
 

@@ -1,19 +1,13 @@
-"""Limits on arriving files: their size and number, the key's quota, free disk space."""
+"""Limits on arriving files: their size and number."""
 
 from __future__ import annotations
-
-import shutil
 
 import sqlalchemy as sa
 from sqlalchemy.orm import Session
 
-from specimap_core.atomic import disk_errors
-from specimap_core.errors import StorageFullError
 from specimap_infra.settings import ServiceSettings
-from specimap_infra.tables import Acquisition, ApiKey, StoredFile, Upload
+from specimap_infra.tables import Acquisition, StoredFile, Upload
 from specimap_service.auth.access import not_found
-from specimap_service.auth.keys import Principal
-from specimap_service.context import AppContext
 from specimap_service.errors import PayloadTooLargeError, QuotaExceededError
 
 
@@ -65,40 +59,4 @@ def check_count(session: Session, settings: ServiceSettings, acquisition_id: str
             f"An acquisition holds at most {settings.max_photos} photos.",
             advice="Delete photos, refused ones first, or make another acquisition.",
             limit=settings.max_photos,
-        )
-
-
-def check_quota(session: Session, principal: Principal, new: int) -> None:
-    """Raise QuotaExceededError where ``new`` more bytes are over the key's quota. Locks the key's row."""
-    session.execute(
-        sa.update(ApiKey).where(ApiKey.id == principal.key_id).values(name=ApiKey.name),
-        execution_options={"synchronize_session": False},
-    )
-    if new > quota_left(session, principal):
-        raise QuotaExceededError(
-            f"With {new} bytes more the key is over its quota of {principal.quota_bytes} bytes.",
-            advice="Delete acquisitions that are no longer needed, or ask the administrator for a higher quota.",
-            quota_bytes=principal.quota_bytes,
-        )
-
-
-def quota_left(session: Session, principal: Principal) -> int:
-    """Return the bytes that the key may still store; unfinished uploads count with their full size."""
-    stored = session.scalar(sa.select(sa.func.sum(StoredFile.size)).where(StoredFile.created_by == principal.key_id))
-    coming = session.scalar(
-        sa.select(sa.func.sum(Upload.size)).where(Upload.created_by == principal.key_id, Upload.state == "open")
-    )
-    return principal.quota_bytes - int(stored or 0) - int(coming or 0)
-
-
-def check_disks(context: AppContext, new: int, coming: int = 0) -> None:
-    """Raise StorageFullError where ``new`` bytes, and those still ``coming``, leave less free than the reserve."""
-    with disk_errors(context.settings.scratch):
-        free = shutil.disk_usage(context.settings.scratch).free
-    stored = context.storage.free_bytes()
-    free = free if stored is None else min(free, stored)
-    if free - coming - new < context.settings.min_free_bytes:
-        raise StorageFullError(
-            "The service's disk is too full for this file.",
-            advice="Ask the administrator to free space; what has been uploaded so far is kept.",
         )

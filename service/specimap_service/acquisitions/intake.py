@@ -17,11 +17,12 @@ from specimap_core.atomic import disk_errors
 from specimap_core.errors import NotFoundError
 from specimap_infra.errors import DatabaseUnavailableError, JobConflictError
 from specimap_infra.tables import Acquisition, StoredFile, Upload
-from specimap_service.acquisitions.capacity import check_count, check_quota, locked_acquisition
+from specimap_service.acquisitions.capacity import check_count, locked_acquisition
 from specimap_service.acquisitions.inspection import Arrival, Findings, Known, judged
 from specimap_service.acquisitions.judge import Judge
 from specimap_service.auth.access import not_found
 from specimap_service.context import AppContext, audit
+from specimap_service.space import check_quota
 
 ATTEMPTS = 5
 """The other part of a cube may arrive or be deleted while one is judged; it is then judged again."""

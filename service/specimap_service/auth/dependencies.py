@@ -10,9 +10,10 @@ from fastapi import Depends, FastAPI, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
+from specimap_infra.errors import DatabaseUnavailableError
 from specimap_service.app_state import AppState
 from specimap_service.auth.access import Access
-from specimap_service.auth.keys import Keyring, Principal
+from specimap_service.auth.keys import KEPT_SECONDS, Keyring, Principal
 from specimap_service.auth.rate_limit import RateLimiter
 from specimap_service.context import AppContext
 from specimap_service.errors import ForbiddenError, UnauthorizedError
@@ -47,10 +48,7 @@ async def authenticated(request: Request) -> Principal:
         DatabaseUnavailableError: keys cannot be looked up.
     """
     keyring, limiter = KEYRING.of(request.app), LIMITER.of(request.app)
-    kind, _, key = request.headers.get("authorization", "").partition(" ")
-    if kind.lower() != "bearer" or not key.strip():
-        raise UnauthorizedError("There is no key.", advice="Send it as `Authorization: Bearer <key>`.")
-    key = key.strip()
+    key = _key_of(request)
     try:
         found = keyring.trusted(key)
         if found is None:
@@ -63,6 +61,33 @@ async def authenticated(request: Request) -> Principal:
     limiter.take(found.key_id, found.rate_per_minute)
     structlog.contextvars.bind_contextvars(key=found.key_id)
     return found
+
+
+def _key_of(request: Request) -> str:
+    kind, _, key = request.headers.get("authorization", "").partition(" ")
+    if kind.lower() != "bearer" or not key.strip():
+        raise UnauthorizedError("There is no key.", advice="Send it as `Authorization: Bearer <key>`.")
+    return key.strip()
+
+
+def trust_of(request: Request) -> Callable[[], Awaitable[float | None]]:
+    """Make a check for answers that last: the seconds for which the request's key is trusted, None where it no longer
+    is. A key that cannot be looked up keeps its trust."""
+    keyring, key = KEYRING.of(request.app), _key_of(request)
+
+    async def seconds() -> float | None:
+        left = keyring.trusted_seconds(key)
+        if left > 0:
+            return left
+        try:
+            await run_in_threadpool(keyring.principal, key)
+        except UnauthorizedError:
+            return None
+        except DatabaseUnavailableError:
+            return KEPT_SECONDS
+        return keyring.trusted_seconds(key)
+
+    return seconds
 
 
 _bearer = HTTPBearer(auto_error=False, scheme_name="key", description="`Authorization: Bearer spk_…`")

@@ -103,6 +103,12 @@ class Keyring:
             found = self._kept.get(_hash(key))
         return found[1] if found is not None and time.monotonic() - found[0] < KEPT_SECONDS else None
 
+    def trusted_seconds(self, key: str) -> float:
+        """Return for how much longer a key is trusted before it is looked up again."""
+        with self._lock:
+            found = self._kept.get(_hash(key))
+        return 0.0 if found is None else max(0.0, found[0] + KEPT_SECONDS - time.monotonic())
+
     def forget(self) -> None:
         """Look every key up again."""
         with self._lock:

@@ -17,6 +17,7 @@ from specimap_service.auth.dependencies import Admin, KeyringDep
 from specimap_service.auth.keys import new_key
 from specimap_service.auth.object_ids import KeyId
 from specimap_service.context import Context, audit
+from specimap_service.errors import RequestInvalidError
 from specimap_service.paging import InProject, Limit, Moment, Page, page_of
 
 router = APIRouter(prefix="/v1", tags=["keys"])
@@ -37,7 +38,7 @@ class KeyRequest(BaseModel):
         pattern=r"^[A-Za-z0-9._-]{1,64}$",
         description="Id or name of its project, for good; by default the project of the key that creates it.",
     )
-    expires_at: Moment | None = None
+    expires_at: Moment | None = Field(default=None, description="From when on it is refused; not in the past.")
     rate_per_minute: int | None = Field(default=None, ge=1, le=10_000_000)
     quota_bytes: int | None = Field(default=None, ge=1, le=2**60)
 
@@ -83,6 +84,12 @@ class Audited(BaseModel):
 @router.post("/keys", status_code=201)
 def create_key(context: Context, principal: Admin, wanted: KeyRequest) -> NewKey:
     """Create a key."""
+    if wanted.expires_at is not None and wanted.expires_at <= utc_now():
+        raise RequestInvalidError(
+            "body.expires_at: the time has passed.",
+            advice="Give a later time, with its zone.",
+            fields=[{"where": "body.expires_at", "what": "the time has passed"}],
+        )
     with context.database.session() as session:
         project_id = principal.project_id if wanted.project is None else found_project(session, wanted.project).id
         row, key = new_key(

@@ -32,6 +32,7 @@ from specimap_service.array_responses import (
     json_answer,
 )
 from specimap_service.auth.dependencies import Labeller, Reader
+from specimap_service.auth.keys import Principal
 from specimap_service.auth.object_ids import CloudId
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.clouds.label_body import (
@@ -44,10 +45,11 @@ from specimap_service.clouds.label_body import (
     parse_metadata,
     parse_values,
 )
-from specimap_service.clouds.label_store import Conditions, delete_label, find_label, no_label, put_label
+from specimap_service.clouds.label_store import Conditions, check_room, delete_label, find_label, no_label, put_label
 from specimap_service.clouds.open_clouds import LabelRecord, OpenClouds
 from specimap_service.context import AppContext, Context
 from specimap_service.errors import MediaTypeError, PayloadTooLargeError
+from specimap_service.space import DISK_EVERY, check_disks
 
 router = APIRouter(prefix="/v1", tags=["labels"])
 LabelName = Annotated[str, Path(pattern=r"^[a-z0-9_-]{1,64}$")]
@@ -124,7 +126,7 @@ async def put(
     points = (await run_in_threadpool(clouds.record, cloud_id)).points
     scratch = context.settings.scratch / f"label-{uuid4().hex}.body.tmp"
     try:
-        await _receive(request, scratch, most_bytes(metadata, points))
+        await _receive(context, principal, request, scratch, most_bytes(metadata, points))
 
         def store() -> tuple[LabelVersion, bool]:
             values = parse_values(scratch, media == ARROW, metadata, points)
@@ -139,21 +141,25 @@ async def put(
     return _view(row)
 
 
-async def _receive(request: Request, target: FilePath, limit: int) -> None:
-    """Write the body to a file. Raises PayloadTooLargeError, StorageFullError."""
+async def _receive(context: AppContext, principal: Principal, request: Request, target: FilePath, limit: int) -> None:
+    """Write the body to a file. Raises PayloadTooLargeError, QuotaExceededError, StorageFullError."""
     too_large = PayloadTooLargeError(
         "The body is larger than these labels can be.", advice="Send a value for each point.", limit_bytes=limit
     )
     length = request.headers.get("content-length", "")
     if length.isdecimal() and int(length) > limit:
         raise too_large
-    size, pieces = 0, bytearray()
+    await to_thread.run_sync(check_room, context, principal, int(length) if length.isdecimal() else 0)
+    size, checked_at, pieces = 0, 0, bytearray()
     with disk_errors(target):
         async for piece in request.stream():
             size += len(piece)
             if size > limit:
                 raise too_large
             pieces += piece
+            if size - checked_at > DISK_EVERY:
+                checked_at = size
+                await to_thread.run_sync(check_disks, context, 0)
             if len(pieces) >= _SENT_TOGETHER:
                 await to_thread.run_sync(partial(_append, target, bytes(pieces)))
                 pieces.clear()
@@ -258,9 +264,16 @@ def _npy(array: PointArray, headers: dict[str, str]) -> Response:
 
 
 @router.delete("/clouds/{cloud_id}/labels/{name}", status_code=204)
-def delete(context: Context, principal: Labeller, clouds: CloudsDep, cloud_id: CloudId, name: LabelName) -> None:
+def delete(
+    context: Context,
+    principal: Labeller,
+    clouds: CloudsDep,
+    cloud_id: CloudId,
+    name: LabelName,
+    if_match: Annotated[str | None, Header(description='The current version, as `"3"`; `*`: any.')] = None,
+) -> None:
     """Delete a layer with all its versions."""
-    delete_label(context, clouds, principal, cloud_id, name)
+    delete_label(context, clouds, principal, cloud_id, name, Conditions.of(if_match, None))
 
 
 def _find(context: AppContext, clouds: OpenClouds, cloud_id: str, name: str, version: int | None) -> LabelVersion:

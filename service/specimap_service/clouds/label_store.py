@@ -27,13 +27,14 @@ from specimap_service.clouds.label_body import LabelMetadata
 from specimap_service.clouds.open_clouds import OpenClouds
 from specimap_service.context import AppContext, audit
 from specimap_service.errors import PreconditionFailedError, RequestInvalidError
+from specimap_service.space import check_disks, check_quota, over_quota, quota_left
 
-_TAG = re.compile(r'^(?:W/)?"?(\d{1,9})"?$')
+_TAG = re.compile(r'^(W/)?(?:"(\d{1,9})"|(\d{1,9}))$')
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """Preconditions of a PUT: If-Match (versions, or any), If-None-Match: * (none)."""
+    """Preconditions of a change: If-Match (versions, or any), If-None-Match: * (none)."""
 
     versions: frozenset[int] | None = None
     """None: no particular version is required."""
@@ -57,7 +58,8 @@ class Conditions:
         found = [_TAG.match(part.strip()) for part in if_match.split(",")]
         if not all(found):
             raise RequestInvalidError("If-Match is no version.", advice='Give the version, as If-Match: "3", or *.')
-        return cls(frozenset(int(tag[1]) for tag in found if tag), exists=True)
+        # If-Match compares strongly (RFC 9110): a weak tag equals none.
+        return cls(frozenset(int(tag[2] or tag[3]) for tag in found if tag and not tag[1]), exists=True)
 
     def check(self, current: int | None) -> None:
         """Raise PreconditionFailedError where the current version is not what was expected."""
@@ -88,13 +90,14 @@ def put_label(
     Raises:
         NotFoundError: the cloud was deleted meanwhile.
         PreconditionFailedError: the conditions do not hold.
-        StorageFullError, StorageUnavailableError: nothing was changed.
+        QuotaExceededError, StorageFullError, StorageUnavailableError: nothing was changed.
     """
     digest = _digest(metadata, values)
     work = context.settings.scratch / f"label-{uuid4().hex}.tmp"
     try:
         with disk_errors(work):
             write_label(work, values)
+        size = sum(file.stat().st_size for file in work.rglob("*") if file.is_file())
         prefix: str | None = None
         try:
             with context.database.session() as session:
@@ -103,6 +106,8 @@ def put_label(
                 if current is not None and current.sha256 == digest:
                     return current, False
                 conditions.check(current.version if current else None)
+                check_disks(context, size)
+                check_quota(session, principal, size)
                 version = current.version + 1 if current else 1
                 # The suffix keeps a layer that is deleted and created again apart from the files of the first.
                 prefix = f"clouds/{cloud_id}/labels/{name}/v{version}-{uuid4().hex[:8]}"
@@ -116,6 +121,7 @@ def put_label(
                     made_by=stored["made_by"],
                     storage_prefix=prefix,
                     sha256=digest,
+                    size=size,
                     created_by=principal.key_id,
                 )
                 session.add(row)
@@ -134,11 +140,32 @@ def put_label(
     return row, True
 
 
-def delete_label(context: AppContext, clouds: OpenClouds, principal: Principal, cloud_id: str, name: str) -> None:
+def check_room(context: AppContext, principal: Principal, announced: int) -> None:
+    """Check before a body is read whether the disks and the key's quota leave room for it.
+
+    Raises:
+        QuotaExceededError, StorageFullError: they do not.
+    """
+    check_disks(context, announced)
+    with context.database.session() as session:
+        # How small the values become is known once they are written.
+        if quota_left(session, principal) <= 0:
+            raise over_quota(principal, announced)
+
+
+def delete_label(
+    context: AppContext,
+    clouds: OpenClouds,
+    principal: Principal,
+    cloud_id: str,
+    name: str,
+    conditions: Conditions,
+) -> None:
     """Remove a layer with all its versions.
 
     Raises:
         NotFoundError: there is no such cloud or layer.
+        PreconditionFailedError: the conditions do not hold.
     """
     with context.database.session() as session:
         lock_cloud(session, cloud_id)
@@ -146,6 +173,7 @@ def delete_label(context: AppContext, clouds: OpenClouds, principal: Principal, 
         prefixes = list(session.scalars(sa.select(LabelVersion.storage_prefix).where(layer)))
         if not prefixes:
             raise no_label(cloud_id, name)
+        conditions.check(session.scalar(sa.select(sa.func.max(LabelVersion.version)).where(layer)))
         session.execute(sa.delete(LabelVersion).where(layer))
         audit(session, principal.key_id, "label.delete", cloud_id, layer=name, versions=len(prefixes))
     clouds.forget(cloud_id)

@@ -15,6 +15,7 @@ from specimap_core.errors import NotFoundError
 from specimap_core.json_text import json_text
 from specimap_service.auth.dependencies import Reader
 from specimap_service.auth.object_ids import CloudId
+from specimap_service.byte_ranges import known_to_client, names_tag
 from specimap_service.clouds import pictures
 from specimap_service.clouds.dependencies import CloudsDep, PicturesDep
 from specimap_service.clouds.label_store import find_label
@@ -81,8 +82,8 @@ class Previews:
         identity = json_text([__version__, cloud_id, grid, size, *parameters])
         tag = hashlib.sha256(identity.encode()).hexdigest()[:32]
         headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache", "Vary": "Authorization"}
-        known = [part.strip().removeprefix("W/") for part in self.request.headers.get("if-none-match", "").split(",")]
-        if f'"{tag}"' in known or "*" in known:
+        if names_tag(self.request, f'"{tag}"'):
+            # The picture was drawn for this client once.
             return Response(status_code=304, headers=headers)
 
         def draw() -> Picture:
@@ -90,6 +91,9 @@ class Previews:
                 return pictures.draw(cloud, paint(cloud), grid, size)
 
         picture = self.cache.get(tag, draw)
+        if known_to_client(self.request, headers["ETag"]):
+            # `*`: any picture, if there is one.
+            return Response(status_code=304, headers=headers)
         if picture.range is not None:
             headers["X-Specimap-Range"] = ",".join(f"{value:.6g}" for value in picture.range)
         if picture.extent_mm is not None:

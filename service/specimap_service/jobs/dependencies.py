@@ -2,21 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
 from typing import Annotated
 
 from fastapi import Depends, FastAPI
 
 from specimap_service.app_state import AppState
+from specimap_service.auth.dependencies import Reader
 from specimap_service.context import AppContext
 from specimap_service.feature import Feature
-from specimap_service.jobs.events import JobEvents
+from specimap_service.jobs.events import JobEvents, Streams
 
 EVENTS = AppState[JobEvents]("job_events")
 
 
+STREAMS = AppState[Streams]("streams")
+
+
 def _open(app: FastAPI, context: AppContext) -> None:
     EVENTS.set(app, JobEvents(context.database))
+    STREAMS.set(app, Streams(context.settings.max_streams_per_key))
+
+
+async def _place(principal: Reader, streams: Annotated[Streams, Depends(STREAMS.of_request)]) -> AsyncIterator[None]:
+    with streams.place(principal.key_id):
+        yield
 
 
 FEATURE = Feature(_open)
 EventsDep = Annotated[JobEvents, Depends(EVENTS.of_request)]
+StreamPlace = Annotated[None, Depends(_place)]
+"""One of the streams that the request's key may follow, held until the answer has ended."""

@@ -3,26 +3,32 @@
 from __future__ import annotations
 
 import asyncio
-from collections import deque
-from collections.abc import AsyncIterator, Iterator
+from collections import Counter, deque
+from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
 import sqlalchemy as sa
+from sqlalchemy.orm import Session
 
 from specimap_infra.database import Database
 from specimap_infra.errors import DatabaseUnavailableError
 from specimap_infra.logs import logger
 from specimap_infra.tables import FINAL_STATES, Job, JobEvent
+from specimap_service.errors import RateLimitedError
 
 POLL_SECONDS = 0.25
 KEEP_ALIVE_SECONDS = 15.0
 RETRY_SECONDS = 1.0
 """How long to wait before a database that did not answer is queried again."""
+RETRY_AFTER_SECONDS = 5
 PAGE = 500
 KEPT = 512
 """Events of a job that are kept for its listeners; a listener further behind reads the database."""
+
+Check = Callable[[], Awaitable[float | None]]
+"""Tells a stream for how many seconds it may go on before it is called again; None: no longer."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,31 @@ class _Channel:
         return [event for event in self.recent if event.seq > seq]
 
 
+class Streams:
+    """How many streams each key follows, in this process."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._counts: Counter[str] = Counter()
+
+    @contextmanager
+    def place(self, key_id: str) -> Iterator[None]:
+        """Hold one of the key's places. Raises RateLimitedError."""
+        if self._counts[key_id] >= self._most:
+            raise RateLimitedError(
+                f"The key follows {self._most} streams of events already.",
+                advice="End one of them; one stream is enough for each job.",
+                retry_after_s=RETRY_AFTER_SECONDS,
+            )
+        self._counts[key_id] += 1
+        try:
+            yield
+        finally:
+            self._counts[key_id] -= 1
+            if not self._counts[key_id]:
+                del self._counts[key_id]
+
+
 class JobEvents:
     """Events by job. Used on one event loop; the database is read in threads, and no connection waits."""
 
@@ -73,14 +104,21 @@ class JobEvents:
         self._poller: asyncio.Task[None] | None = None
         self._joined = asyncio.Event()
 
-    async def follow(self, job_id: str, after: int) -> AsyncIterator[Event | None]:
+    async def follow(self, job_id: str, after: int, check: Check) -> AsyncGenerator[Event | None]:
         """Yield events after number ``after`` as they occur, and None now and then while nothing happens.
 
-        Ends after the final event, or when the job is deleted. Waits while the database is unavailable.
+        Ends after the final event, when the job is deleted, or when ``check`` says so. Waits while the database is
+        unavailable. ``after`` is not beyond the job's last event: all its listeners share one position.
         """
+        clock = asyncio.get_running_loop().time
         with self._listening(job_id, after) as channel:
-            seq = after
+            seq, told, due = after, clock(), clock()
             while True:
+                if clock() >= due:
+                    seconds = await check()
+                    if seconds is None:
+                        return
+                    due = clock() + seconds
                 changed = channel.changed
                 events = channel.after(seq)
                 if events is None:
@@ -97,12 +135,16 @@ class JobEvents:
                     if event.final:
                         return
                 if events:
+                    told = clock()
                     continue
-                try:
-                    await asyncio.wait_for(changed.wait(), KEEP_ALIVE_SECONDS)
-                except TimeoutError:
-                    if not await self._exists(job_id):
+                alive = told + KEEP_ALIVE_SECONDS
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(changed.wait(), max(0.0, min(due, alive) - clock()))
+                    continue
+                if clock() >= alive:
+                    if await self._over(job_id, seq):
                         return
+                    told = clock()
                     yield None
 
     @contextmanager
@@ -148,15 +190,32 @@ class JobEvents:
         with suppress(TimeoutError):
             await asyncio.wait_for(self._joined.wait(), seconds)
 
-    async def _exists(self, job_id: str) -> bool:
+    async def _over(self, job_id: str, seq: int) -> bool:
+        """Return whether no event can come after number ``seq``."""
+
         def find() -> bool:
             with self._database.session() as session:
-                return session.get(Job, job_id) is not None
+                job = session.get(Job, job_id)
+                return job is None or position(session, job, seq) is None
 
         try:
             return await asyncio.to_thread(find)
         except DatabaseUnavailableError:
-            return True
+            return False
+
+
+def position(session: Session, job: Job, seen: int) -> int | None:
+    """Return the number after which a listener follows a job; None where nothing comes after the last event seen.
+
+    It is the number of the last event that there is, where the one that was seen is beyond it.
+    """
+    last = sa.select(sa.func.max(JobEvent.seq)).where(JobEvent.job_id == job.id)
+    found = session.scalar(last) or 0
+    # The state after the events: the final event of a job that goes on has a higher number.
+    session.refresh(job)
+    if job.state in FINAL_STATES and seen >= (session.scalar(last) or 0):
+        return None
+    return min(seen, found)
 
 
 def read_events(database: Database, after: dict[str, int]) -> dict[str, list[Event]]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator, AsyncIterator
+from contextlib import aclosing
 from typing import Annotated, Any
 
 import sqlalchemy as sa
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.sse import KEEPALIVE_COMMENT, EventSourceResponse, format_sse_event
 
@@ -16,15 +17,15 @@ from specimap_core.report.model import Report
 from specimap_infra.errors import JobConflictError
 from specimap_infra.job_schemas import JobState, JobView, job_views
 from specimap_infra.jobs import locked, request_cancel
-from specimap_infra.tables import FINAL_STATES, CloudRow, Job, JobEvent
+from specimap_infra.tables import CloudRow, Job, JobEvent
 from specimap_service.auth.access import in_sight
-from specimap_service.auth.dependencies import Admin, Reader, Uploader
+from specimap_service.auth.dependencies import Admin, Reader, Uploader, trust_of
 from specimap_service.auth.object_ids import JobId
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import AppContext, Context, audit
 from specimap_service.jobs.commands import delete_job, found_job, new_job, repeated_job, stop_workflow
-from specimap_service.jobs.dependencies import EventsDep
-from specimap_service.jobs.events import JobEvents
+from specimap_service.jobs.dependencies import EventsDep, StreamPlace
+from specimap_service.jobs.events import Event, position
 from specimap_service.jobs.schemas import (
     AfterJob,
     AfterSeq,
@@ -177,37 +178,38 @@ def get_log(
 async def follow_events(
     context: Context,
     principal: Reader,
+    place: StreamPlace,
     events: EventsDep,
+    request: Request,
     job_id: JobId,
     last_event_id: LastEventId = None,
     after: AfterSeq = None,
 ) -> Response:
-    """Stream the job's events, from its beginning or after the last event seen, until it ends.
+    """Stream the job's events, from its beginning or after the last event seen, until it ends; also when the key
+    is revoked or expires. A key may follow `SPECIMAP_MAX_STREAMS_PER_KEY` streams.
 
     `event` is `state` {state, error, cloud_id}, `progress` {stage, progress} or `log` {level, message, data}; `id`
     counts from 1. A comment is sent every 15 s while there is no event.
     """
-    start = int(last_event_id) if last_event_id else after or 0
-    if await run_in_threadpool(_nothing_after, context, job_id, start):
+    start = await run_in_threadpool(_position, context, job_id, int(last_event_id) if last_event_id else after or 0)
+    if start is None:
         return Response(status_code=204)
     return EventSourceResponse(
-        _encoded(events, job_id, start),
+        _encoded(events.follow(job_id, start, trust_of(request))),
         # Proxies that buffer answers would hold the events back.
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
 
 
-def _nothing_after(context: AppContext, job_id: str, seq: int) -> bool:
+def _position(context: AppContext, job_id: str, seen: int) -> int | None:
     with context.database.session() as session:
-        job = found_job(session, job_id)
-        later = sa.select(JobEvent.seq).where(JobEvent.job_id == job_id, JobEvent.seq > seq).limit(1)
-        # The state first, so that events between the two queries are seen.
-        return job.state in FINAL_STATES and session.scalar(later) is None
+        return position(session, found_job(session, job_id), seen)
 
 
-async def _encoded(events: JobEvents, job_id: str, after: int) -> AsyncIterator[bytes]:
-    async for event in events.follow(job_id, after):
-        if event is None:
-            yield KEEPALIVE_COMMENT
-        else:
+async def _encoded(events: AsyncGenerator[Event | None]) -> AsyncIterator[bytes]:
+    async with aclosing(events):
+        async for event in events:
+            if event is None:
+                yield KEEPALIVE_COMMENT
+                continue
             yield format_sse_event(data_str=json_text(event.data), event=event.type, id=str(event.seq))

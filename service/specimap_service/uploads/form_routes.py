@@ -11,10 +11,8 @@ from specimap_infra.ids import new_id
 from specimap_infra.tables import Acquisition
 from specimap_service.acquisitions.capacity import (
     check_count,
-    check_disks,
     check_size,
     max_file_bytes,
-    quota_left,
 )
 from specimap_service.acquisitions.inspection import Arrival
 from specimap_service.acquisitions.intake import clean_name, take_in
@@ -25,12 +23,12 @@ from specimap_service.auth.keys import Principal
 from specimap_service.auth.object_ids import AcquisitionId
 from specimap_service.context import AppContext, Context
 from specimap_service.errors import QuotaExceededError, RequestInvalidError
+from specimap_service.space import DISK_EVERY, check_disks, quota_left
 from specimap_service.uploads.dependencies import UploadsDep
 from specimap_service.uploads.lifecycle import Uploads
 from specimap_service.uploads.multipart import FormFiles, Part
 
 router = APIRouter(prefix="/v1", tags=["files"])
-DISK_EVERY = 64 * 1024 * 1024
 FORM: dict[str, Any] = {
     "requestBody": {
         "required": True,

@@ -22,7 +22,7 @@ from specimap_infra.errors import JobConflictError
 from specimap_infra.ids import new_id
 from specimap_infra.logs import logger
 from specimap_infra.tables import ROLES, Acquisition, StoredFile, Upload
-from specimap_service.acquisitions.capacity import check_count, check_disks, check_quota, check_size, locked_acquisition
+from specimap_service.acquisitions.capacity import check_count, check_size, locked_acquisition
 from specimap_service.acquisitions.inspection import Arrival
 from specimap_service.acquisitions.intake import clean_name, take_in
 from specimap_service.acquisitions.judge import Judge
@@ -31,6 +31,7 @@ from specimap_service.auth.access import load, no_upload
 from specimap_service.auth.keys import Principal
 from specimap_service.context import AppContext, audit
 from specimap_service.errors import ForbiddenError, RequestInvalidError, UploadGoneError
+from specimap_service.space import check_disks, check_quota
 from specimap_service.uploads.files import UploadFiles
 
 ABANDONED_SECONDS = 3600.0
@@ -130,6 +131,12 @@ class Uploads:
         if upload.state == "open" and upload.expires_at <= utc_now():
             self.expire(upload_id)
             upload.state = "expired"
+        return upload
+
+    def renewed(self, upload: Upload) -> Upload:
+        """Return the upload as it stands now, where another request has finished or ended it since it was read."""
+        if upload.state == "open" and self.files.size(upload.id) is None:
+            return self._row(upload.id)
         return upload
 
     def finish(self, upload_id: str) -> Upload:

@@ -40,7 +40,7 @@ class UploadResult(BaseModel):
 @router.get("/uploads/{upload_id}/result")
 def get_result(principal: Uploader, uploads: UploadsDep, upload_id: UploadId) -> UploadResult:
     """Return the state of an upload; for a finished one its file, with the judgement and advice on retaking it."""
-    upload = uploads.current(upload_id, principal)
+    upload = uploads.renewed(uploads.current(upload_id, principal))
     stored = uploads.stored_file(upload)
     return UploadResult(
         id=upload.id,

@@ -23,7 +23,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from specimap_core.atomic import disk_errors
 from specimap_infra.tables import Upload
 from specimap_service.auth.keys import Principal
-from specimap_service.errors import ChecksumMismatchError, RequestInvalidError, UploadConflictError
+from specimap_service.errors import ChecksumInvalidError, ChecksumMismatchError, UploadConflictError
 
 PREFIX = "/v1/uploads"
 VERSION = "1.0.0"
@@ -132,18 +132,21 @@ def too_long() -> UploadConflictError:
 
 
 def parsed_checksum(given: str) -> tuple[str, bytes]:
-    """Return algorithm and digest of an Upload-Checksum header. Raises RequestInvalidError."""
+    """Return algorithm and digest of an Upload-Checksum header. Raises ChecksumInvalidError."""
     algorithm, _, encoded = given.strip().partition(" ")
     try:
         if algorithm not in ALGORITHMS:
             raise ValueError
-        return algorithm, base64.b64decode(encoded, validate=True)
+        digest = base64.b64decode(encoded, validate=True)
+        if len(digest) != hashlib.new(algorithm, usedforsecurity=False).digest_size:
+            raise ValueError
     except (ValueError, binascii.Error) as error:
-        raise RequestInvalidError(
-            "Upload-Checksum does not read.",
+        raise ChecksumInvalidError(
+            "Upload-Checksum names an algorithm that is not served, or its digest does not read.",
             advice=f"Give one of {', '.join(ALGORITHMS)}, a space, and the digest in base64.",
             field="Upload-Checksum",
         ) from error
+    return algorithm, digest
 
 
 def http_date(upload: Upload) -> str:

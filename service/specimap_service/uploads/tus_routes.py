@@ -115,6 +115,7 @@ def _completion_hook(uploads: UploadsDep) -> Callable[[str, dict[str, str]], Awa
         exchange = tus.exchange()
         if exchange.upload is not None and exchange.upload.state == "open":
             exchange.upload = await asyncio.to_thread(uploads.finish, upload_id)
+        if exchange.upload is not None:
             await asyncio.to_thread(_add_result_headers, uploads, exchange.upload, exchange)
 
     return complete
@@ -185,7 +186,9 @@ def _document(route: APIRoute) -> None:
 def mount(app: FastAPI) -> None:
     """Add the tus routes to an app whose features are open."""
     context, uploads = CONTEXT.of(app), UPLOADS.of(app)
-    store = UploadStore(uploads.files, received=context.metrics.uploaded.inc, delete=uploads.terminate)
+    store = UploadStore(
+        uploads.files, received=context.metrics.uploaded.inc, delete=uploads.terminate, renewed=uploads.renewed
+    )
     # The library's annotations do not say that hooks may be coroutines and return a value.
     hooks: dict[str, Any] = {
         "pre_create_dep": _creation_hook,

@@ -13,10 +13,12 @@ from typing import Any
 from tuspyserver.storage import TusStorage
 
 from specimap_core.atomic import disk_errors
-from specimap_core.errors import SpecimapError
+from specimap_core.errors import NotFoundError, SpecimapError
 from specimap_infra.errors import StorageUnavailableError
+from specimap_infra.tables import Upload
 from specimap_service.auth.keys import Principal
 from specimap_service.uploads.files import POLL_SECONDS, UploadFiles, busy
+from specimap_service.uploads.lifecycle import check_alive
 from specimap_service.uploads.tus import BATCH, Exchange, exchange, http_date
 
 TAKEOVER_SECONDS = 2.0
@@ -65,9 +67,14 @@ class UploadStore(TusStorage):
     """The library's storage interface on :class:`UploadFiles`. Uploads are described by rows, not by side files."""
 
     def __init__(
-        self, files: UploadFiles, *, received: Callable[[int], None], delete: Callable[[str, Principal], None]
+        self,
+        files: UploadFiles,
+        *,
+        received: Callable[[int], None],
+        delete: Callable[[str, Principal], None],
+        renewed: Callable[[Upload], Upload],
     ) -> None:
-        self._files, self._received, self._delete = files, received, delete
+        self._files, self._received, self._delete, self._renewed = files, received, delete, renewed
         self._locked: dict[str, _LockedFile] = {}
 
     async def create(self, uid: str) -> None:
@@ -75,8 +82,16 @@ class UploadStore(TusStorage):
 
     async def exists(self, uid: str) -> bool:
         """Return whether the request's upload has a file, or had a complete one."""
-        upload = exchange().upload
+        upload = await self._renew()
         return upload is not None and (upload.state != "open" or self._files.size(uid) is not None)
+
+    async def _renew(self) -> Upload | None:
+        """Return the request's upload as it stands. Raises UploadGoneError where it was ended meanwhile."""
+        current = exchange()
+        if current.upload is not None and current.upload.state == "open":
+            current.upload = await asyncio.to_thread(self._renewed, current.upload)
+            check_alive(current.upload)
+        return current.upload
 
     async def size(self, uid: str) -> int:
         """Return the bytes that have arrived."""
@@ -153,7 +168,18 @@ class UploadStore(TusStorage):
             return
         clock = asyncio.get_running_loop().time
         deadline = clock() + LOCK_SECONDS
-        while (handle := self._files.try_lock(uid)) is None:
+        while True:
+            try:
+                handle = self._files.try_lock(uid)
+            except NotFoundError:
+                # Another request has finished it while this one waited: its offset is its length now.
+                upload = await self._renew()
+                if upload is None or upload.state == "open":
+                    raise
+                yield
+                return
+            if handle is not None:
+                break
             other = self._locked.get(uid)
             if other is not None and other.holder.silent_seconds() > TAKEOVER_SECONDS:
                 other.holder.abandon()
