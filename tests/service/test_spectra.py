@@ -277,7 +277,6 @@ def test_a_long_answer_takes_little_memory(wide: httpx.Client, accept: str) -> N
     finally:
         tracemalloc.stop()
     assert received > (20e6 if accept == JSON else 100e6)
-    print("PEAK", accept, peak, received)
     assert peak < 50e6
 
 

@@ -14,7 +14,7 @@ T = TypeVar("T")
 
 READS = TurnBounds(at_once=3, of_key=2, waiting=512, waiting_of_key=128, retry_after_s=1)
 LONG_ANSWERS = TurnBounds(at_once=16, of_key=4, waiting=64, waiting_of_key=16)
-"""Answers of several batches: each holds up to 25 MB as long as its client takes to receive it."""
+"""Answers of several batches: each holds up to 50 MB as long as its client takes to receive it."""
 PARSES = TurnBounds(at_once=2, of_key=1, waiting=64, waiting_of_key=32, retry_after_s=1)
 """Selections of up to 4 MiB: each takes the processor for a while."""
 

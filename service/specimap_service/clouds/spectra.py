@@ -25,8 +25,8 @@ MOST_VALUES, MOST_JSON_VALUES = 40_000_000, 4_000_000
 MOST_VERTICES = 10_000
 MOST_CROSSINGS = 1_000_000
 """Rows that the edges of a polygon cross, all together: a hundred times what an outline drawn by hand has."""
-ROUND_VALUES = 2**23
-"""Stored values that are read together, 16 MiB: points in any order touch each chunk once a round, not once a batch."""
+ROUND_VALUES = 2**22
+"""Stored values that are read together, 8 MiB: points in any order touch each chunk once a round, not once a batch."""
 
 FieldName = Literal["xyz", "normal", "rgb", "hsi_pixel", "sigma_mm", "flags", "distance_mm"]
 Place = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
