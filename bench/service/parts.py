@@ -9,6 +9,7 @@ from typing import Any
 from bench.machine import in_words
 from bench.service.clouds import bench_cloud, sheet_cloud
 from bench.service.jobs import bench_jobs, sheet_jobs
+from bench.service.neighbour import bench_neighbour, sheet_neighbour
 from bench.service.options import Options
 from bench.service.shard import bench_shard, sheet_shard
 from bench.service.sheet import Sheet
@@ -22,6 +23,7 @@ PARTS: dict[str, tuple[Callable[[Path, Options], Figures], Callable[[Figures], l
     "shard": (bench_shard, sheet_shard),
     "upload": (bench_upload, sheet_upload),
     "jobs": (bench_jobs, sheet_jobs),
+    "neighbour": (bench_neighbour, sheet_neighbour),
 }
 
 

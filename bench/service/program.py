@@ -1,4 +1,4 @@
-"""``python -m bench.service [--only spectrum|cloud|shard|upload|jobs] [--repeats N] [--jobs N]``."""
+"""``python -m bench.service [--only spectrum|cloud|shard|upload|jobs|neighbour] [--repeats N] [--jobs N]``."""
 
 from __future__ import annotations
 

@@ -51,6 +51,12 @@ class PhotoRawError(PhotoUnreadableError):
     code = "photo_raw"
 
 
+class PhotoTooLargeError(PhotoUnreadableError):
+    """A photo has more pixels than are decoded; ``details['limit_pixels']``."""
+
+    code = "photo_too_large"
+
+
 class TooFewPhotosError(SpecimapError, ValueError):
     """Fewer photos than the minimum, as given or after refusing some."""
 

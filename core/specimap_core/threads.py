@@ -1,8 +1,13 @@
-"""Threads of the libraries below numpy, set before numpy is loaded: so nothing is imported here."""
+"""Threads of the libraries below numpy, set before numpy is loaded, and the rank of a process among others: so nothing
+is imported here."""
 
 from __future__ import annotations
 
 import os
+from contextlib import suppress
+
+NICENESS = 5
+"""Leaves a quarter of a core where processes of usual rank want it too: behind answers, without being starved."""
 
 
 def limit_blas_threads() -> None:
@@ -13,3 +18,13 @@ def limit_blas_threads() -> None:
     makes them wait for one another (the markers' solve takes 15 times as long on a busy machine).
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+def step_back() -> None:
+    """Let this process and its children give way to processes of usual rank, such as the one that answers requests."""
+    with suppress(OSError):
+        os.nice(NICENESS)
+    # Linux may rank processes within their session only, and the sessions by this: for one that began its own.
+    if os.getsid(0) == os.getpid():
+        with suppress(OSError), open("/proc/self/autogroup", "w", encoding="ascii") as rank:
+            rank.write(str(NICENESS))

@@ -89,6 +89,11 @@ class ServiceSettings(BaseSettings):
     )
 
     max_photo_bytes: int = Field(default=64 * MIB, ge=1, description="Largest photo.")
+    max_photo_pixels: int = Field(
+        default=60_000_000,
+        ge=1_000_000,
+        description="Most pixels of a photo that is decoded whole: anything but a JPEG that is not progressive, which comes reduced and may have 250 million.",
+    )
     max_cube_bytes: int = Field(default=8 * GIB, ge=1, description="Largest cube file.")
     max_photos: int = Field(default=300, ge=1, description="Largest number of photos of one acquisition.")
     quota_bytes: int = Field(

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractAsyncContextManager, nullcontext
+from dataclasses import dataclass
 from itertools import chain
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import orjson
 import pyarrow as pa
 from fastapi import Request
+from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response, StreamingResponse
+from starlette.types import Receive, Scope, Send
 
 from specimap_core.arrays import Array
 from specimap_service.errors import NotAcceptableError
@@ -20,12 +24,45 @@ JSON = "application/json"
 ARROW = "application/vnd.apache.arrow.stream"
 NPY = "application/x-npy"
 OFFERED = (JSON, ARROW, NPY)
-BATCH = 4096
-"""Rows that are read, encoded and sent together: the part of an answer that is in memory at a time."""
+BATCH, BATCH_VALUES = 4096, 2**19
+"""Most rows, and most values, that are read, encoded and sent together: what an answer has in memory at a time."""
+JSON_BATCH_VALUES = 2**16
+"""The same for JSON: the interpreter does nothing else while a piece is encoded, some milliseconds."""
 _ARROW_END = b"\xff\xff\xff\xff\x00\x00\x00\x00"
 
 Columns = Mapping[str, Array]
 """Arrays (n,) or (n, m) by name, of one length."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """``count`` rows of ``width`` values each; ``read(start, stop)`` gives some."""
+
+    count: int
+    width: int
+    read: Callable[[int, int], Array]
+
+
+class Pace(Protocol):
+    """When and where the pieces of a long answer are made."""
+
+    def sending(self) -> AbstractAsyncContextManager[None]:
+        """Hold what a long answer needs while it is sent. Raises TooManyAtOnceError, OverloadedError."""
+
+    async def read(self, work: Callable[..., bytes], *arguments: Any) -> bytes:
+        """Make one piece in a thread."""
+
+
+class _AtOnce:
+    def sending(self) -> AbstractAsyncContextManager[None]:
+        return nullcontext()
+
+    async def read(self, work: Callable[..., bytes], *arguments: Any) -> bytes:
+        return await run_in_threadpool(work, *arguments)
+
+
+AT_ONCE: Pace = _AtOnce()
+"""Each piece as soon as the one before has been sent."""
 
 
 def documented_responses(model: Any) -> dict[int | str, dict[str, Any]]:
@@ -77,6 +114,34 @@ def json_answer(content: Mapping[str, Any], headers: Mapping[str, str] | None = 
 
 def json_bytes(content: Mapping[str, Any]) -> bytes:
     """Encode as :func:`json_answer` does."""
+    return _encoded(content)
+
+
+def json_rows_answer(
+    before: Mapping[str, Any],
+    name: str,
+    rows: Rows,
+    after: Mapping[str, Any] | None = None,
+    headers: Mapping[str, str] | None = None,
+    pace: Pace = AT_ONCE,
+) -> Response:
+    """Answer with one JSON object: ``before``, the rows as the array ``name``, ``after``; read as in
+    :func:`arrow_answer`.
+    """
+    batch = max(1, JSON_BATCH_VALUES // max(rows.width, 1))
+    head, tail = _encoded(before)[1:-1], _encoded(after or {})[1:-1]
+    opening = b"{" + head + (b"," if head else b"") + b'"' + name.encode() + b'":['
+    closing = b"]" + (b"," if tail else b"") + tail + b"}"
+
+    def encoded(values: Array) -> bytes:
+        return _encoded(np.ascontiguousarray(values))[1:-1]
+
+    first = encoded(rows.read(0, min(batch, rows.count)))
+    later = (b"," + encoded(rows.read(a, b)) for a, b in _batches(rows.count, batch))
+    return _answer(chain([opening + first], later, [closing]), rows.count <= batch, JSON, headers, pace)
+
+
+def _encoded(content: object) -> bytes:
     return orjson.dumps(content, default=_plain, option=orjson.OPT_SERIALIZE_NUMPY)
 
 
@@ -92,23 +157,24 @@ def arrow_answer(
     read: Callable[[int, int], Columns],
     metadata: Mapping[str, str],
     headers: Mapping[str, str] | None = None,
+    width: int = 1,
+    pace: Pace = AT_ONCE,
 ) -> Response:
     """Answer with an Arrow IPC stream. ``read(start, stop)`` gives the columns of these rows.
 
-    A column (n, m) becomes lists of m. ``metadata`` goes into the schema. The first batch is read before the answer
-    begins, so that an error in it still reaches the client; the rest is read while the answer is sent.
+    A column (n, m) becomes lists of m; ``width`` is that of the widest. ``metadata`` goes into the schema. The first
+    batch is read before the answer begins, so that an error in it still reaches the client; the rest is read while the
+    answer is sent, at the ``pace`` given.
     """
-    first = _batch(read(0, min(BATCH, rows)))
+    size = batch_rows(width)
+    first = _batch(read(0, min(size, rows)))
     schema = first.schema.with_metadata(dict(metadata))
-    later = (_batch(read(at, min(at + BATCH, rows))) for at in range(BATCH, rows, BATCH))
     pieces = chain(
         [schema.serialize().to_pybytes(), first.serialize().to_pybytes()],
-        (batch.serialize().to_pybytes() for batch in later),
+        (_batch(read(a, b)).serialize().to_pybytes() for a, b in _batches(rows, size)),
         [_ARROW_END],
     )
-    if rows <= BATCH:
-        return Response(b"".join(pieces), headers=dict(headers or {}), media_type=ARROW)
-    return StreamingResponse(pieces, headers=dict(headers or {}), media_type=ARROW)
+    return _answer(pieces, rows <= size, ARROW, headers, pace)
 
 
 def _batch(columns: Columns) -> pa.RecordBatch:
@@ -123,7 +189,10 @@ def _column(values: Array) -> pa.Array:
 
 
 def npy_answer(
-    shape: tuple[int, ...], read: Callable[[int, int], Array], headers: Mapping[str, str] | None = None
+    shape: tuple[int, ...],
+    read: Callable[[int, int], Array],
+    headers: Mapping[str, str] | None = None,
+    pace: Pace = AT_ONCE,
 ) -> Response:
     """Answer with a ``.npy`` file of little-endian float32; ``read(start, stop)`` gives its rows.
 
@@ -131,16 +200,51 @@ def npy_answer(
     """
     head = io.BytesIO()
     np.lib.format.write_array_header_1_0(head, {"descr": "<f4", "fortran_order": False, "shape": shape})
-    rows = shape[0]
-    first = _raw(read(0, min(BATCH, rows)))
-    pieces: Iterator[bytes] = chain(
-        [head.getvalue(), first], (_raw(read(at, min(at + BATCH, rows))) for at in range(BATCH, rows, BATCH))
-    )
-    if rows <= BATCH:
-        return Response(b"".join(pieces), headers=dict(headers or {}), media_type=NPY)
+    rows, size = shape[0], batch_rows(int(np.prod(shape[1:])))
+    first = _raw(read(0, min(size, rows)))
+    pieces = chain([head.getvalue(), first], (_raw(read(a, b)) for a, b in _batches(rows, size)))
     length = len(head.getvalue()) + 4 * int(np.prod(shape))
-    return StreamingResponse(pieces, headers={**(headers or {}), "Content-Length": str(length)}, media_type=NPY)
+    return _answer(pieces, rows <= size, NPY, {**(headers or {}), "Content-Length": str(length)}, pace)
 
 
 def _raw(values: Array) -> bytes:
     return np.ascontiguousarray(values, "<f4").tobytes()
+
+
+# ---- pieces -------------------------------------------------------------------------------------------
+
+
+def batch_rows(width: int) -> int:
+    """Return how many rows of ``width`` values are read, encoded and sent together."""
+    return max(1, min(BATCH, BATCH_VALUES // max(width, 1)))
+
+
+def _batches(rows: int, size: int) -> Iterator[tuple[int, int]]:
+    """First row of each batch but the first, and the one after its last."""
+    return ((at, min(at + size, rows)) for at in range(size, rows, size))
+
+
+def _answer(
+    pieces: Iterator[bytes], whole: bool, media_type: str, headers: Mapping[str, str] | None, pace: Pace
+) -> Response:
+    if whole:
+        return Response(b"".join(pieces), headers=dict(headers or {}), media_type=media_type)
+    return _Paced(pieces, media_type, dict(headers or {}), pace)
+
+
+class _Paced(StreamingResponse):
+    """An answer that is made piece by piece, each only when the one before has been sent."""
+
+    def __init__(self, pieces: Iterator[bytes], media_type: str, headers: dict[str, str], pace: Pace) -> None:
+        super().__init__(_made(pieces, pace), headers=headers, media_type=media_type)
+        self._pace = pace
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the pieces; what is refused is refused before the answer begins."""
+        async with self._pace.sending():
+            await super().__call__(scope, receive, send)
+
+
+async def _made(pieces: Iterator[bytes], pace: Pace) -> AsyncIterator[bytes]:
+    while piece := await pace.read(next, pieces, b""):
+        yield piece

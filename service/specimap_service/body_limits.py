@@ -7,10 +7,8 @@ which are read into memory.
 from __future__ import annotations
 
 import re
-from functools import partial
 from typing import TypeVar
 
-from anyio import CapacityLimiter, to_thread
 from fastapi.exceptions import RequestValidationError
 from fastapi.requests import Request
 from pydantic import BaseModel, ValidationError
@@ -20,6 +18,7 @@ from specimap_core.errors import SpecimapError
 from specimap_infra.logs import logger
 from specimap_service.auth.dependencies import PRINCIPAL, authenticated
 from specimap_service.errors import PayloadTooLargeError, RequestInvalidError
+from specimap_service.fair_turns import FairTurns
 from specimap_service.http_status import status_of
 from specimap_service.problems import problem_response
 
@@ -123,16 +122,19 @@ def _too_many() -> RequestInvalidError:
     return RequestInvalidError("body: too many fields.", advice="Correct the request; /docs shows it.")
 
 
-async def parsed(request: Request, model: type[Model], limiter: CapacityLimiter) -> Model:
+async def parsed(request: Request, model: type[Model], turns: FairTurns, key: str) -> Model:
     """Parse a large JSON body in a thread, so that other requests are answered meanwhile.
 
-    ``limiter`` bounds how many are parsed at a time.
+    ``turns`` bounds how many are parsed at a time, and shares them between keys.
 
     Raises:
         RequestValidationError, RequestInvalidError: the body is not such a document.
+        TooManyAtOnceError, OverloadedError: too many wait to be parsed.
     """
     body = await request.body()
-    return await to_thread.run_sync(partial(_parse, body, model), limiter=limiter)
+    if len(body) <= LARGEST_JSON:  # a millisecond: less than a thread for it would cost all together
+        return _parse(body, model)
+    return await turns.run(key, _parse, body, model)
 
 
 def _parse(body: bytes, model: type[Model]) -> Model:

@@ -23,6 +23,18 @@ class RateLimitedError(SpecimapError, RuntimeError):
     code = "rate_limited"
 
 
+class TooManyAtOnceError(RateLimitedError):
+    """The key has too many requests of a costly kind waiting; try again after ``details['retry_after_s']`` seconds."""
+
+    code = "too_many_at_once"
+
+
+class OverloadedError(SpecimapError, RuntimeError):
+    """All keys together ask for more than the service can do; try again after ``details['retry_after_s']`` seconds."""
+
+    code = "overloaded"
+
+
 class RequestInvalidError(SpecimapError, ValueError):
     """The request's body, path or query does not fit the contract; details list the fields."""
 

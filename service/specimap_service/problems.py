@@ -63,7 +63,7 @@ RESPONSES: dict[int | str, dict[str, Any]] = {
 def problem_response(error: SpecimapError, status: int | None = None, **headers: str) -> JSONResponse:
     """Make the answer to an error."""
     status = status or status_of(error)
-    if isinstance(error, RateLimitedError):
+    if isinstance(error, RateLimitedError) or "retry_after_s" in error.details:
         headers["Retry-After"] = str(error.details.get("retry_after_s", 1))
     if isinstance(error, UnauthorizedError):
         headers["WWW-Authenticate"] = "Bearer"

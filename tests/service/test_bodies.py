@@ -198,7 +198,8 @@ def test_a_large_selection_is_read_and_a_wrong_one_is_told_of_once(shared: Runni
     def posted(document: str) -> httpx.Response:
         return client.post(CLOUD, content=document, headers={"Content-Type": "application/json"})
 
-    full = json.dumps({"select": {"pixels": [[65535, 65535]] * 100_000}, "bands": {"indices": [4_000_000_000] * 65536}})
+    bands = list(range(4_000_000_000, 4_000_000_000 + 65536))
+    full = json.dumps({"select": {"pixels": [[65535, 65535]] * 100_000}, "bands": {"indices": bands}})
     assert len(full) < LARGEST_SELECTION
     assert posted(full).status_code == 404
     wrong = posted(json.dumps({"select": {"pixels": [["a", 0.5]] * 100_000}}))

@@ -7,7 +7,9 @@ import signal
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from specimap_infra.settings import load_settings
 from specimap_service.acquisitions.judge import Judge
@@ -133,5 +135,22 @@ def test_a_copy_that_ends_while_it_waits_is_no_fault_of_the_next_file(tmp_path: 
         until(lambda: not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] == "Z", 20, "its end")
         for _ in range(4):  # each of the two children is asked
             assert judge.cube(folder / "good")["verdict"] == "accepted"
+    finally:
+        judge.close()
+
+
+def test_photos_of_more_pixels_than_the_setting_are_refused_by_their_header(tmp_path: Path) -> None:
+    folder = tmp_path / "task"
+    folder.mkdir()
+    picture = Image.fromarray(np.zeros((1000, 1001, 3), np.uint8))
+    judge = Judge(load_settings(data_dir=tmp_path / "data", max_photo_pixels=1_000_000), os.environ)
+    try:
+        picture.save(folder / "a", "PNG")
+        verdict = judge.photo(folder / "a", "DICT_4X4_50", [], [])
+        assert (verdict["verdict"], verdict["code"]) == ("refused", "photo_too_large")
+        assert "1001 x 1000" in verdict["reason"]
+        assert "JPEG" in verdict["advice"]
+        picture.save(folder / "a", "JPEG")  # which comes reduced
+        assert judge.photo(folder / "a", "DICT_4X4_50", [], [])["verdict"] == "doubtful"
     finally:
         judge.close()

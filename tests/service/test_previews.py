@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
@@ -18,7 +19,14 @@ from specimap_service.clouds.picture_cache import PictureCache
 from specimap_service.clouds.pictures import Picture
 from tests.support.cloud_scene import FakeCube, counts, scene
 from tests.support.result_scene import Result, put_result
-from tests.support.service_scene import Running
+from tests.support.service_scene import Running, serving
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    """One for all tests here, since its drawing processes take a second to start."""
+    with serving(tmp_path_factory.mktemp("previews")) as running:
+        yield running
 
 
 @pytest.fixture
@@ -204,15 +212,17 @@ def test_probabilities_as_a_colour_scale(client: httpx.Client, result: Result) -
 
 
 def test_etag_spares_the_drawing(service: Running, client: httpx.Client, result: Result) -> None:
+    cache: PictureCache = service.app.state.pictures.cache
+    before = cache.kept_bytes
     first = client.get(previews(result, "band"), params={"b": "1"})
-    kept = service.app.state.pictures.kept_bytes
-    assert kept == len(first.content)
+    kept = cache.kept_bytes
+    assert kept == before + len(first.content)
     tag = first.headers["etag"]
     for given in (tag, f'"x", W/{tag}', "*"):
         known = client.get(previews(result, "band"), params={"b": "1"}, headers={"If-None-Match": given})
         assert (known.status_code, known.content, known.headers["etag"]) == (304, b"", tag)
     assert client.get(previews(result, "band"), params={"b": "1"}).content == first.content
-    assert service.app.state.pictures.kept_bytes == kept
+    assert cache.kept_bytes == kept
     other = client.get(previews(result, "band"), params={"b": "2"}, headers={"If-None-Match": tag})
     assert other.status_code == 200
 
@@ -266,18 +276,20 @@ def test_cache_drops_what_was_not_used_for_longest() -> None:
     cache, drawn = PictureCache(most_bytes=100), []
 
     def get(tag: str) -> None:
-        def draw() -> Picture:
+        found = cache.find(tag)
+        if found is None:
             drawn.append(tag)
-            return Picture(bytes(40), None, None)
-
-        assert len(cache.get(tag, draw).png) == 40
+            cache.keep(tag, Picture(bytes(40), None, None))
+        else:
+            assert len(found.png) == 40
 
     for tag in ("a", "b", "a", "c", "a", "b"):
         get(tag)
     assert drawn == ["a", "b", "c", "b"]
     assert cache.kept_bytes == 80
     huge = Picture(bytes(200), None, None)
-    assert cache.get("huge", lambda: huge) is huge
+    cache.keep("huge", huge)
+    assert cache.find("huge") is None
     assert cache.kept_bytes == 0
 
 

@@ -18,6 +18,7 @@ from specimap_core.errors import NotFoundError
 Indices = NDArray[np.intp]
 _NEAREST_BATCH = 16
 _CHUNKS_TOGETHER = 32
+_BYTES_TOGETHER = 2**24
 
 
 class Cloud(CloudArrays):
@@ -133,11 +134,13 @@ class Cloud(CloudArrays):
         chunks = np.argsort(to_box, kind="stable")
         k = max(0, min(k, self.n_points))
         best, distance = np.empty(0, np.intp), np.empty(0)
-        for at in range(0, len(chunks), _NEAREST_BATCH):
+        # What is found so far is sorted after each batch: for many points, a few large batches.
+        batch = max(_NEAREST_BATCH, -(-k // CHUNK_POINTS))
+        for at in range(0, len(chunks), batch):
             # Boxes come by distance: once the k found are nearer than the next box, none can be nearer.
             if len(best) == k and (k == 0 or to_box[chunks[at]] > distance[-1]):
                 break
-            points = _points_of(np.sort(chunks[at : at + _NEAREST_BATCH]), self.n_points)
+            points = _points_of(np.sort(chunks[at : at + batch]), self.n_points)
             found = np.linalg.norm(self._xyz_of(points) - place, axis=1)
             best, distance = np.concatenate([best, points]), np.concatenate([distance, found])
             order = np.lexsort((best, distance))[:k]
@@ -169,7 +172,8 @@ class Cloud(CloudArrays):
         chunk = points // array.chunk_points
         order = np.argsort(chunk, kind="stable")
         ranked = chunk[order]
-        gap = (np.diff(ranked) > 1) | (np.diff(ranked // _CHUNKS_TOGETHER) > 0)
+        together = max(1, min(_CHUNKS_TOGETHER, _BYTES_TOGETHER // max(1, array.chunk_points * array.point_bytes)))
+        gap = (np.diff(ranked) > 1) | (np.diff(ranked // together) > 0)
         for which in np.split(order, np.flatnonzero(gap) + 1):
             if len(which):
                 first = int(chunk[which[0]]) * array.chunk_points

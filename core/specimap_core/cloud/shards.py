@@ -28,6 +28,7 @@ from specimap_core.errors import CloudDamagedError, NotFoundError, SpecimapError
 _ENTRY_BYTES, _CHECKSUM_BYTES = 16, 4
 _ABSENT = 2**64 - 1
 _READ_THREADS = 2
+_BLOCK_BYTES = 2**25
 
 
 @contextmanager
@@ -81,6 +82,11 @@ class PointArray:
                 self.dtype, self.chunk_points = self._other.dtype, self._other.chunks[0]
         self._index = lru_cache(None)(self._read_index)
 
+    @property
+    def point_bytes(self) -> int:
+        """Bytes of a point's values."""
+        return int(np.prod(self.shape[1:], dtype=np.int64)) * self.dtype.itemsize
+
     def read(self, start: int, stop: int, out: Array | None = None) -> Array:
         """Values (stop - start, ...) of points [start, stop), into ``out`` if given.
 
@@ -100,8 +106,12 @@ class PointArray:
         return out
 
     def blocks(self, points: int, start: int = 0, stop: int | None = None) -> Iterator[tuple[int, Array]]:
-        """First point and values of consecutive blocks of at most ``points``, read ahead by two threads."""
+        """First point and values of consecutive blocks of at most ``points``, read ahead by two threads.
+
+        Blocks are smaller where a point has more values than usual.
+        """
         stop = self.shape[0] if stop is None else stop
+        points = min(points, _BLOCK_BYTES // max(1, self.point_bytes))
         points = max(1, points // self.chunk_points) * self.chunk_points
         # Blocks after the first begin where a chunk begins.
         edges = [start, *range((start // points + 1) * points, stop, points), stop]

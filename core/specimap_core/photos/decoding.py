@@ -15,7 +15,7 @@ from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 from pillow_heif import register_heif_opener
 
 from specimap_core.atomic import name_as_text
-from specimap_core.errors import PhotoRawError, PhotoUnreadableError
+from specimap_core.errors import PhotoRawError, PhotoTooLargeError, PhotoUnreadableError
 from specimap_core.photos.formats import FORMATS, NAMES, RAW_SUFFIXES, suffix_of
 
 LARGEST_PHOTO_PIXELS = 250_000_000
@@ -27,6 +27,7 @@ TURNED_BY_READER = ("TIFF", "HEIF")
 DRAFTED = ("JPEG", "MPO")
 """A JPEG decodes straight to a half or a quarter of its size where that is still large enough; for HEIF, a draft is the
 thumbnail, which is another picture."""
+STRIP_ROWS = 64
 BIT_DEPTHS = (8, 10, 12, 14, 16)
 DNG_VERSION = 50706
 PHOTOMETRIC = 262
@@ -105,9 +106,40 @@ def photo_suffix(path: Path) -> str:
             return suffix_of(opened.format)
     except Exception as error:
         # Not a list of types: on damaged files the decoders raise anything.
-        raise PhotoUnreadableError(
-            "The photo is of no known image format.", advice=f"Give a {NAMES} as the camera made it."
-        ) from error
+        raise _no_format() from error
+
+
+def _no_format() -> PhotoUnreadableError:
+    return PhotoUnreadableError(
+        "The photo is of no known image format.", advice=f"Give a {NAMES} as the camera made it."
+    )
+
+
+def check_pixels(path: Path, most_whole: int) -> None:
+    """Refuse a photo by its header, before it is decoded, if it has to be decoded whole and has too many pixels for it.
+
+    A JPEG that is not progressive comes reduced, and may be larger.
+
+    Raises:
+        PhotoTooLargeError: it has more than ``most_whole`` pixels.
+        PhotoUnreadableError: it is of no known image format.
+    """
+    set_up_pillow()
+    try:
+        with Image.open(path, formats=tuple(FORMATS)) as opened:
+            (width, height), kind = opened.size, opened.format
+            reduced = kind in DRAFTED and not opened.info.get("progressive")
+    except Exception as error:
+        raise _no_format() from error
+    # More than that no way of decoding takes, which :func:`decode_photo` says.
+    if most_whole < width * height <= LARGEST_PHOTO_PIXELS and not reduced:
+        raise PhotoTooLargeError(
+            f"{name_as_text(path)} has {width} x {height} pixels; of a {kind} file {most_whole / 1e6:g} million "
+            "are decoded at most.",
+            advice="Save it as a JPEG that is not progressive, or reduce it: 12 million pixels are plenty.",
+            photo=name_as_text(path),
+            limit_pixels=most_whole,
+        )
 
 
 def decode_photo(path: Path, least_px: int) -> Decoded:
@@ -226,12 +258,17 @@ def _reason(error: Exception) -> str:
 
 def _eight_bit(image: Image.Image) -> NDArray[np.uint8]:
     if image.mode.startswith(("I", "F")):
-        values = np.asarray(image, float)
-        most = float(values.max(initial=0, where=np.isfinite(values)))
+        values = np.asarray(image)
+        # Some rows at a time: as doubles, the whole would take eight times the memory, and several times the time.
+        strips = [values[at : at + STRIP_ROWS] for at in range(0, len(values), STRIP_ROWS)]
+        most = max((float(strip.max(initial=0, where=np.isfinite(strip))) for strip in strips), default=0.0)
         tops = [2.0**bits - 1 for bits in BIT_DEPTHS]
         top = 1.0 if image.mode.startswith("F") and most <= 1 else next((t for t in tops if most <= t), most)
-        grey = np.clip(np.nan_to_num(values) / top * 255, 0, 255).astype(np.uint8)
-        return np.repeat(grey[..., None], 3, axis=2)
+        pixels = np.empty((*values.shape, 3), np.uint8)
+        for k, strip in enumerate(strips):
+            grey = np.clip(np.nan_to_num(strip.astype(float)) / top * 255, 0, 255).astype(np.uint8)
+            pixels[k * STRIP_ROWS : (k + 1) * STRIP_ROWS] = grey[..., None]
+        return pixels
     return np.asarray(image if image.mode == "RGB" else image.convert("RGB"), np.uint8)
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from specimap_core.errors import NoMarkersFoundError, PhotoUnreadableError, WrongDictionaryError
 from specimap_core.fiducials.detection import detect_markers, fitting_dictionaries, shared_sightings
-from specimap_core.photos.decoding import photo_suffix
+from specimap_core.photos.decoding import LARGEST_PHOTO_PIXELS, check_pixels, photo_suffix
 from specimap_core.photos.reading import AcquisitionSettings, read_photo, same_shape
 from specimap_core.screening.verdict import Verdict
 
@@ -51,9 +51,11 @@ class Others:
     sizes: Sequence[tuple[int, int]] = ()
 
 
-def judge_photo(path: Path, dictionary: str, others: Others) -> Verdict:
+def judge_photo(path: Path, dictionary: str, others: Others, most_pixels: int = LARGEST_PHOTO_PIXELS) -> Verdict:
     """Judge a photo. Facts: ``suffix`` by its format, ``width``, ``height``, ``sharpness``, ``marker_ids``,
     ``dictionary_seen`` where its markers are of another one.
+
+    One of more than ``most_pixels`` that would have to be decoded whole is refused by its header.
     """
     facts: dict[str, Any] = {
         "suffix": ".bin",
@@ -65,6 +67,7 @@ def judge_photo(path: Path, dictionary: str, others: Others) -> Verdict:
     }
     try:
         facts["suffix"] = photo_suffix(path)
+        check_pixels(path, most_pixels)
         photo = read_photo(path, AcquisitionSettings())
     except PhotoUnreadableError as error:
         return Verdict("refused", error.code, error.message.replace(path.name, "The photo", 1), error.advice, facts)

@@ -36,6 +36,7 @@ from specimap_core.sandbox.places import Rule
 from specimap_core.screening.cube import judge_cube, judge_part
 from specimap_core.screening.photo import Others, judge_photo
 from specimap_core.screening.verdict import Verdict
+from specimap_core.threads import step_back
 
 LARGEST_ANSWER = 256 * 1024
 MOST_OPEN = 128
@@ -45,7 +46,7 @@ DIED: dict[str, Any] = {"died": True}
 
 def _photo(task: dict[str, Any]) -> Verdict:
     others = Others(task["sharpness"], [(w, h) for w, h in task["sizes"]])
-    return judge_photo(Path(task["path"]), task["dictionary"], others)
+    return judge_photo(Path(task["path"]), task["dictionary"], others, task["most_pixels"])
 
 
 def _part(task: dict[str, Any]) -> Verdict:
@@ -147,6 +148,7 @@ def main() -> None:
     memory, largest_file = int(sys.argv[1]), int(sys.argv[2])
     mode: Mode = sys.argv[3] if len(sys.argv) > 3 and sys.argv[3] in MODES else "best-effort"  # type: ignore[assignment]
     die_with(os.getppid())
+    step_back()
     # Libraries that print must not get between the lines.
     out = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)

@@ -1,4 +1,5 @@
-"""The judge of arriving files, and the unfinished uploads that go with a deleted acquisition."""
+"""The judge of arriving files, the turns at taking them in, and the unfinished uploads that go with a deleted
+acquisition."""
 
 from __future__ import annotations
 
@@ -12,6 +13,7 @@ from fastapi import Depends, FastAPI
 from specimap_service.acquisitions.judge import Judge
 from specimap_service.app_state import AppState
 from specimap_service.context import AppContext
+from specimap_service.fair_turns import FairTurns, TurnBounds
 from specimap_service.feature import Feature
 
 
@@ -23,11 +25,16 @@ class UnfinishedUploads(Protocol):
 
 
 JUDGE = AppState[Judge]("judge")
+INTAKE = AppState[FairTurns]("intake")
+INTAKES = TurnBounds(at_once=8, of_key=4, waiting=256, waiting_of_key=64, retry_after_s=5)
+"""Files that have arrived and are hashed, judged and stored: at a time, and waiting for it. A waiting one takes a
+connection and its place on the disk, and no thread."""
 UNFINISHED_UPLOADS = AppState[UnfinishedUploads]("unfinished_uploads")
 
 
 def _open(app: FastAPI, context: AppContext) -> None:
     JUDGE.set(app, Judge(context.settings, os.environ))
+    INTAKE.set(app, FairTurns(INTAKES))
 
 
 @asynccontextmanager
@@ -35,9 +42,11 @@ async def _running(app: FastAPI) -> AsyncIterator[None]:
     try:
         yield
     finally:
+        INTAKE.of(app).close()
         JUDGE.of(app).close()
 
 
 FEATURE = Feature(_open, _running)
 JudgeDep = Annotated[Judge, Depends(JUDGE.of_request)]
+IntakeDep = Annotated[FairTurns, Depends(INTAKE.of_request)]
 UnfinishedUploadsDep = Annotated[UnfinishedUploads, Depends(UNFINISHED_UPLOADS.of_request)]

@@ -92,7 +92,7 @@ def _photo(judge: Judge, arrival: Arrival, known: Known, path: Path) -> Findings
     others = [PhotoJudgement.model_validate(photo.judgement) for photo in known.photos]
     sharpness = [j.sharpness for j in others if j.sharpness is not None and j.code != "photo_blurred"]
     sizes = [(j.width, j.height) for j in others if j.width is not None and j.height is not None]
-    verdict = judge.photo(path, known.dictionary, sharpness, sizes)
+    verdict = judge.photo(path, known.dictionary, sharpness, sizes, arrival.key_id)
     return Findings(verdict.pop("suffix"), PhotoJudgement.model_validate(verdict))
 
 
@@ -101,7 +101,7 @@ def _cube(judge: Judge, storage: Storage, arrival: Arrival, known: Known, folder
     header = there.get("header")
     expected = None if header is None else header.judgement.get("expected_bytes")
     claimed = PurePosixPath(arrival.name).suffix.lower()
-    verdict = judge.part(folder / "file", claimed, expected)
+    verdict = judge.part(folder / "file", claimed, expected, arrival.key_id)
     suffix: str = verdict.pop("suffix")
     own = CubeJudgement.model_validate(verdict)
     if own.verdict == "refused":
@@ -110,14 +110,14 @@ def _cube(judge: Judge, storage: Storage, arrival: Arrival, known: Known, folder
     path = folder / f"{arrival.role}{suffix}"
     (folder / "file").rename(path)
     if own.part == "whole":
-        own = CubeJudgement.model_validate({"part": "whole", **judge.cube(path)})
+        own = CubeJudgement.model_validate({"part": "whole", **judge.cube(path, arrival.key_id)})
         return Findings(suffix, _fitted(arrival.role, own, known))
     other = there.get(OTHER_PART[own.part])
     if other is None:
         own = own.model_copy(update={"waiting_for": OTHER_PART[own.part]})
         return Findings(suffix, _fitted(arrival.role, own, known))
     storage.fetch(other.storage_key, folder / other.label)
-    pair = judge.cube(folder / f"{arrival.role}.hdr")
+    pair = judge.cube(folder / f"{arrival.role}.hdr", arrival.key_id)
     own, others = _paired(own, CubeJudgement.model_validate(other.judgement), pair)
     return Findings(suffix, _fitted(arrival.role, own, known), (other, _fitted(arrival.role, others, known)))
 

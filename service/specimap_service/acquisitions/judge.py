@@ -17,8 +17,11 @@ from specimap_core.sandbox.json_lines import InvalidMessageError, JsonLineProces
 from specimap_infra.logs import logger
 from specimap_infra.settings import ServiceSettings
 from specimap_service.acquisitions.verdicts import checked_verdict
+from specimap_service.fair_turns import FairTurns, TurnBounds
 
-CHILDREN = 2
+CHILDREN = TurnBounds(at_once=3, of_key=2, waiting=0, waiting_of_key=0)
+"""Files judged at a time, of all keys and of one: however many a key sends, another one finds a child free. How many
+wait is bounded before they come here."""
 START_SECONDS = 60
 COMMAND = (sys.executable, "-m", "specimap_core.screening")
 KEPT_VARIABLES = ("PATH", "LANG", "LC_ALL", "LD_LIBRARY_PATH", "PYTHONPATH", "HOME", "VIRTUAL_ENV")
@@ -28,7 +31,9 @@ Verdict = dict[str, Any]
 
 
 class Judge:
-    """Up to two children, started when first needed and kept warm. Safe to share between threads."""
+    """Up to three children, started when first needed and kept warm, and shared fairly between keys. Safe to share
+    between threads.
+    """
 
     def __init__(
         self, settings: ServiceSettings, environment: Mapping[str, str], command: Sequence[str] = COMMAND
@@ -44,26 +49,29 @@ class Judge:
             *map(str, settings.private_places),
         )
         # Threads of its own: a child dies with the thread that started it, and the app's threads come and go.
-        self._threads = ThreadPoolExecutor(CHILDREN, thread_name_prefix="judge")
+        self._threads = ThreadPoolExecutor(CHILDREN.at_once, thread_name_prefix="judge")
+        self._turns = FairTurns(CHILDREN)
         self._of_thread = threading.local()
         self._children: set[JsonLineProcess] = set()
         self._lock = threading.Lock()
         self._closed = False
 
     def photo(
-        self, path: Path, dictionary: str, sharpness: Sequence[float], sizes: Sequence[tuple[int, int]]
+        self, path: Path, dictionary: str, sharpness: Sequence[float], sizes: Sequence[tuple[int, int]], key: str = ""
     ) -> Verdict:
-        """Judge a photo, given the sharpness and sizes of the acquisition's others."""
-        task = {"kind": "photo", "path": str(path), "dictionary": dictionary}
-        return self._judge({**task, "sharpness": list(sharpness), "sizes": list(sizes)})
+        """Judge a photo, given the sharpness and sizes of the acquisition's others; ``key``: who sent it."""
+        task: dict[str, Any] = {"kind": "photo", "path": str(path), "dictionary": dictionary}
+        task["most_pixels"] = self._settings.max_photo_pixels
+        return self._judge({**task, "sharpness": list(sharpness), "sizes": list(sizes)}, key)
 
-    def part(self, path: Path, claimed: str, expected_bytes: int | None) -> Verdict:
+    def part(self, path: Path, claimed: str, expected_bytes: int | None, key: str = "") -> Verdict:
         """Find which part of a cube a file is."""
-        return self._judge({"kind": "part", "path": str(path), "claimed": claimed, "expected_bytes": expected_bytes})
+        task = {"kind": "part", "path": str(path), "claimed": claimed, "expected_bytes": expected_bytes}
+        return self._judge(task, key)
 
-    def cube(self, path: Path) -> Verdict:
+    def cube(self, path: Path, key: str = "") -> Verdict:
         """Judge a whole cube, alone in its folder with its data."""
-        return self._judge({"kind": "cube", "path": str(path)})
+        return self._judge({"kind": "cube", "path": str(path)}, key)
 
     def warm(self) -> None:
         """Start a child, if none is there, without waiting for it: one will be needed soon."""
@@ -77,6 +85,7 @@ class Judge:
         with self._lock:
             self._closed = True
             children = list(self._children)
+        self._turns.close()
         for child in children:
             child.kill()
         # A thread that waits for one of them sees it end; pipes are closed only after that.
@@ -84,11 +93,12 @@ class Judge:
         for child in children:
             child.close()
 
-    def _judge(self, task: dict[str, Any]) -> Verdict:
-        if self._closed:
-            raise _stopping_error()
+    def _judge(self, task: dict[str, Any], key: str) -> Verdict:
         try:
-            return self._threads.submit(self._ask, task).result()
+            with self._turns.turn(key):
+                if self._closed:
+                    raise _stopping_error()
+                return self._threads.submit(self._ask, task).result()
         except CancelledError as error:
             raise _stopping_error() from error
 

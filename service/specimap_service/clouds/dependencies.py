@@ -1,31 +1,30 @@
-"""Open clouds, pictures drawn of them, and the limit on parsing large selections."""
+"""Open clouds, pictures drawn of them, and the turns at reading them."""
 
 from __future__ import annotations
 
 from typing import Annotated
 
-from anyio import CapacityLimiter
 from fastapi import Depends, FastAPI
 
 from specimap_service.app_state import AppState
 from specimap_service.clouds.open_clouds import OpenClouds
-from specimap_service.clouds.picture_cache import PictureCache
+from specimap_service.clouds.picture_queue import PictureQueue
+from specimap_service.clouds.reading import Reading
 from specimap_service.context import AppContext
 from specimap_service.feature import Feature
 
 OPEN_CLOUDS = AppState[OpenClouds]("open_clouds")
-PICTURES = AppState[PictureCache]("pictures")
-PARSING = AppState[CapacityLimiter]("parsing")
-"""Large selections are parsed one at a time: each takes the processor for a while."""
+PICTURES = AppState[PictureQueue]("pictures")
+READING = AppState[Reading]("reading")
 
 
 def _open(app: FastAPI, context: AppContext) -> None:
     OPEN_CLOUDS.set(app, OpenClouds(context.storage, context.database))
-    PICTURES.set(app, PictureCache())
-    PARSING.set(app, CapacityLimiter(1))
+    PICTURES.set(app, PictureQueue(context.settings))
+    READING.set(app, Reading())
 
 
 FEATURE = Feature(_open)
 CloudsDep = Annotated[OpenClouds, Depends(OPEN_CLOUDS.of_request)]
-PicturesDep = Annotated[PictureCache, Depends(PICTURES.of_request)]
-ParsingDep = Annotated[CapacityLimiter, Depends(PARSING.of_request)]
+PicturesDep = Annotated[PictureQueue, Depends(PICTURES.of_request)]
+ReadingDep = Annotated[Reading, Depends(READING.of_request)]

@@ -26,10 +26,11 @@ from specimap_service.array_responses import (
     ARROW,
     JSON,
     NPY,
+    Rows,
     arrow_answer,
     chosen_type,
     documented_responses,
-    json_answer,
+    json_rows_answer,
 )
 from specimap_service.auth.dependencies import Labeller, Reader
 from specimap_service.auth.keys import Principal
@@ -244,9 +245,9 @@ def get_values(
             "version": row.version,
             "kind": row.kind,
             "classes": row.classes,
-            "values": array.read(0, array.shape[0]),
         }
-        return json_answer(shown, headers)
+        width = int(np.prod(array.shape[1:]))
+        return json_rows_answer(shown, "values", Rows(array.shape[0], width, array.read), headers=headers)
 
 
 def _npy(array: PointArray, headers: dict[str, str]) -> Response:

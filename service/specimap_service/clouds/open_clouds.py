@@ -21,6 +21,7 @@ from specimap_infra.labels import current_labels
 from specimap_infra.storage import Storage
 from specimap_infra.tables import CloudRow, Job
 from specimap_service.auth.access import not_found
+from specimap_service.clouds.stored_folder import StoredFolder
 
 KEPT_SECONDS = 2.0
 """How long a row is used without a new query: the delay of a deletion, and of a new label in other processes."""
@@ -60,27 +61,6 @@ class CloudRecord:
     def zarr(self) -> str:
         """The Zarr group's folder in the storage."""
         return f"{self.prefix}/cloud.zarr"
-
-
-@dataclass(frozen=True)
-class StoredFolder:
-    """Files below a prefix of the storage, as the reader of clouds wants them."""
-
-    storage: Storage
-    prefix: str
-
-    @property
-    def name(self) -> str:
-        """The last part of the prefix."""
-        return self.prefix.rpartition("/")[2]
-
-    def size(self, key: str) -> int:
-        """Return the size of a file, bytes. Raises NotFoundError, StorageUnavailableError."""
-        return self.storage.stat(f"{self.prefix}/{key}").size
-
-    def read(self, key: str, start: int = 0, stop: int | None = None) -> bytes:
-        """Read the bytes of a file. Raises NotFoundError, StorageUnavailableError."""
-        return self.storage.read(f"{self.prefix}/{key}", start, stop)
 
 
 class OpenClouds:
@@ -144,14 +124,18 @@ class OpenClouds:
         try:
             yield record, self._opened(record)
         except CloudDamagedError as error:
-            self.forget(cloud_id)
-            self.record(cloud_id)
-            array = error.details.get("array")
-            raise CloudDamagedError(
-                f"The array {array} of cloud {cloud_id} cannot be read." if array else f"{cloud_id} cannot be read.",
-                advice="Run the job again; finished stages are not repeated.",
-                **({"array": array} if array else {}),
-            ) from error
+            raise self.damage_of(cloud_id, error) from error
+
+    def damage_of(self, cloud_id: str, error: CloudDamagedError) -> CloudDamagedError:
+        """Return what a client is told of a damaged cloud. Raises NotFoundError where it was deleted meanwhile."""
+        self.forget(cloud_id)
+        self.record(cloud_id)
+        array = error.details.get("array")
+        return CloudDamagedError(
+            f"The array {array} of cloud {cloud_id} cannot be read." if array else f"{cloud_id} cannot be read.",
+            advice="Run the job again; finished stages are not repeated.",
+            **({"array": array} if array else {}),
+        )
 
     def label_array(self, label: LabelRecord) -> PointArray:
         """Open the stored values of a label. Raises CloudDamagedError; call it within :meth:`reading`."""

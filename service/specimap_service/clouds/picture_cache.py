@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
 
 from specimap_service.clouds.pictures import Picture
 
 MOST_BYTES = 128 * 1024**2
-DRAWN_AT_ONCE = 2
-"""Pictures drawn at the same time: each takes up to some hundred megabytes of memory meanwhile."""
 
 
 class PictureCache:
@@ -21,34 +18,22 @@ class PictureCache:
         self._kept: OrderedDict[str, Picture] = OrderedDict()
         self._bytes = 0
         self._lock = threading.Lock()
-        self._drawing = threading.BoundedSemaphore(DRAWN_AT_ONCE)
-
-    def get(self, tag: str, draw: Callable[[], Picture]) -> Picture:
-        """Return the picture of a tag, drawn if it is not cached."""
-        found = self._find(tag)
-        if found is not None:
-            return found
-        with self._drawing:
-            # Another request may have drawn it while this one waited.
-            found = self._find(tag)
-            if found is None:
-                found = draw()
-                self._keep(tag, found)
-        return found
 
     @property
     def kept_bytes(self) -> int:
         """Bytes of all cached pictures."""
         return self._bytes
 
-    def _find(self, tag: str) -> Picture | None:
+    def find(self, tag: str) -> Picture | None:
+        """Return the picture of a tag, if it is kept."""
         with self._lock:
             found = self._kept.get(tag)
             if found is not None:
                 self._kept.move_to_end(tag)
             return found
 
-    def _keep(self, tag: str, picture: Picture) -> None:
+    def keep(self, tag: str, picture: Picture) -> None:
+        """Keep a picture, and drop others where there is no room."""
         with self._lock:
             if tag not in self._kept:
                 self._kept[tag] = picture

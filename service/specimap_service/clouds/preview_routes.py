@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
 
 from specimap_core import __version__
-from specimap_core.cloud import Cloud
-from specimap_core.errors import NotFoundError
+from specimap_core.errors import CloudDamagedError, NotFoundError
 from specimap_core.json_text import json_text
+from specimap_infra.tables import LabelVersion
 from specimap_service.auth.dependencies import Reader
 from specimap_service.auth.object_ids import CloudId
 from specimap_service.byte_ranges import known_to_client, names_tag
-from specimap_service.clouds import pictures
+from specimap_service.clouds import drawing
 from specimap_service.clouds.dependencies import CloudsDep, PicturesDep
+from specimap_service.clouds.drawing import Drawing, Paint
 from specimap_service.clouds.label_store import find_label
-from specimap_service.clouds.open_clouds import LabelRecord, OpenClouds
-from specimap_service.clouds.picture_cache import PictureCache
-from specimap_service.clouds.pictures import LARGEST_SIDE, Grid, Picture, PointColours
-from specimap_service.context import Context
+from specimap_service.clouds.open_clouds import OpenClouds
+from specimap_service.clouds.picture_queue import PictureQueue
+from specimap_service.clouds.pictures import LARGEST_SIDE, Grid
+from specimap_service.context import AppContext, Context
 from specimap_service.errors import RequestInvalidError
 
 router = APIRouter(prefix="/v1/clouds/{cloud_id}/previews", tags=["previews"])
@@ -40,7 +42,6 @@ High = Annotated[
 ]
 BAND = r"^(\d{1,5}|\d{1,5}(\.\d{1,4})?nm)$"
 TRUE_COLOUR = ("640nm", "550nm", "460nm")
-Paint = Callable[[Cloud], PointColours]
 
 
 def _band(description: str) -> Any:
@@ -72,12 +73,13 @@ class Previews:
     """Answers to one request with a picture of a cloud, drawn or cached."""
 
     clouds: OpenClouds
-    cache: PictureCache
+    queue: PictureQueue
     request: Request
+    key: str
 
-    def picture(self, cloud_id: str, grid: Grid, size: int, paint: Paint, parameters: list[Any]) -> Response:
+    async def picture(self, cloud_id: str, grid: Grid, size: int, paint: Paint, parameters: list[Any]) -> Response:
         """Answer with a picture; ``parameters`` are everything else that it depends on."""
-        self.clouds.record(cloud_id)
+        record = await run_in_threadpool(self.clouds.record, cloud_id)
         # A cloud never changes: parameters and program version identify the picture.
         identity = json_text([__version__, cloud_id, grid, size, *parameters])
         tag = hashlib.sha256(identity.encode()).hexdigest()[:32]
@@ -85,12 +87,10 @@ class Previews:
         if names_tag(self.request, f'"{tag}"'):
             # The picture was drawn for this client once.
             return Response(status_code=304, headers=headers)
-
-        def draw() -> Picture:
-            with self.clouds.reading(cloud_id) as (_, cloud):
-                return pictures.draw(cloud, paint(cloud), grid, size)
-
-        picture = self.cache.get(tag, draw)
+        try:
+            picture = await self.queue.picture(self.key, tag, Drawing(record.prefix, paint, grid, size))
+        except CloudDamagedError as error:
+            raise await run_in_threadpool(self.clouds.damage_of, cloud_id, error) from error
         if known_to_client(self.request, headers["ETag"]):
             # `*`: any picture, if there is one.
             return Response(status_code=304, headers=headers)
@@ -101,16 +101,16 @@ class Previews:
         return Response(picture.png, headers=headers, media_type="image/png")
 
 
-async def previews_of_request(request: Request, clouds: CloudsDep, cache: PicturesDep) -> Previews:
+async def previews_of_request(principal: Reader, request: Request, clouds: CloudsDep, queue: PicturesDep) -> Previews:
     """Combine the objects that pictures need: a dependency, ``async`` so that it takes no thread."""
-    return Previews(clouds, cache, request)
+    return Previews(clouds, queue, request, principal.key_id)
 
 
 PreviewsDep = Annotated[Previews, Depends(previews_of_request)]
 
 
 @router.get("/rgb.png", response_class=Response, responses=PNG)
-def rgb(
+async def rgb(
     principal: Reader,
     previews: PreviewsDep,
     cloud_id: CloudId,
@@ -118,12 +118,11 @@ def rgb(
     grid: GridChoice = "cube",
 ) -> Response:
     """Show the photos' colours."""
-    return previews.picture(cloud_id, grid, size, pictures.paint_rgb, ["rgb"])
+    return await previews.picture(cloud_id, grid, size, drawing.rgb, ["rgb"])
 
 
 @router.get("/pca.png", response_class=Response, responses=PNG)
-def pca(
-    context: Context,
+async def pca(
     principal: Reader,
     previews: PreviewsDep,
     cloud_id: CloudId,
@@ -131,16 +130,11 @@ def pca(
     grid: GridChoice = "cube",
 ) -> Response:
     """Show the first three principal components of the spectra as colours, as the run drew them."""
-
-    def paint(cloud: Cloud) -> PointColours:
-        prefix = previews.clouds.record(cloud_id).prefix
-        return pictures.paint_pca(cloud, context.storage.read(f"{prefix}/preview.png"))
-
-    return previews.picture(cloud_id, grid, size, paint, ["pca"])
+    return await previews.picture(cloud_id, grid, size, drawing.pca, ["pca"])
 
 
 @router.get("/band.png", response_class=Response, responses=PNG)
-def band(
+async def band(
     principal: Reader,
     previews: PreviewsDep,
     cloud_id: CloudId,
@@ -155,15 +149,12 @@ def band(
     if (b is None) == (nm is None):
         raise RequestInvalidError("Which band is not said, or said twice.", advice="Give either b or nm.")
     chosen, limits = b if b is not None else f"{nm:.4f}nm", _limits(low, high)
-
-    def paint(cloud: Cloud) -> PointColours:
-        return pictures.paint_band(cloud, pictures.band_index(cloud, chosen), limits)
-
-    return previews.picture(cloud_id, grid, size, paint, ["band", chosen, limits])
+    paint = partial(drawing.band, given=chosen, limits=limits)
+    return await previews.picture(cloud_id, grid, size, paint, ["band", chosen, limits])
 
 
 @router.get("/composite.png", response_class=Response, responses=PNG)
-def composite(
+async def composite(
     principal: Reader,
     previews: PreviewsDep,
     cloud_id: CloudId,
@@ -174,16 +165,12 @@ def composite(
     grid: GridChoice = "cube",
 ) -> Response:
     """Show three bands as red, green and blue, each between its 2nd and 98th percentile."""
-
-    def paint(cloud: Cloud) -> PointColours:
-        red, green, blue = (pictures.band_index(cloud, given) for given in (r, g, b))
-        return pictures.paint_composite(cloud, (red, green, blue))
-
-    return previews.picture(cloud_id, grid, size, paint, ["composite", r, g, b])
+    paint = partial(drawing.composite, given=(r, g, b))
+    return await previews.picture(cloud_id, grid, size, paint, ["composite", r, g, b])
 
 
 @router.get("/index.png", response_class=Response, responses=PNG)
-def index(
+async def index(
     principal: Reader,
     previews: PreviewsDep,
     cloud_id: CloudId,
@@ -196,16 +183,12 @@ def index(
 ) -> Response:
     """Show the normalised difference (a - b) / (a + b) as a colour scale; transparent where a + b is not positive."""
     limits = _limits(low, high)
-
-    def paint(cloud: Cloud) -> PointColours:
-        first, second = (pictures.band_index(cloud, given) for given in (a, b))
-        return pictures.paint_index(cloud, first, second, limits)
-
-    return previews.picture(cloud_id, grid, size, paint, ["index", a, b, limits])
+    paint = partial(drawing.index, given=(a, b), limits=limits)
+    return await previews.picture(cloud_id, grid, size, paint, ["index", a, b, limits])
 
 
 @router.get("/label.png", response_class=Response, responses=PNG)
-def label(
+async def label(
     context: Context,
     principal: Reader,
     previews: PreviewsDep,
@@ -223,10 +206,7 @@ def label(
 ) -> Response:
     """Show a label layer over the dimmed photos: classes in their colours, probabilities on a scale from 0 to 1."""
     limits = _limits(low, high)
-    previews.clouds.record(cloud_id)
-    with context.database.session() as session:
-        row = find_label(session, cloud_id, name, version)
-    record = LabelRecord(row.name, row.version, row.kind, row.storage_prefix)
+    row = await run_in_threadpool(_label_row, context, previews.clouds, cloud_id, name, version)
     known = [item["value"] for item in row.classes]
     if class_value is not None and (row.kind == "class" or class_value not in known):
         raise NotFoundError(
@@ -234,17 +214,20 @@ def label(
             advice="Its classes are in the details.",
             classes=known,
         )
-
-    def paint(cloud: Cloud) -> PointColours:
-        array = previews.clouds.label_array(record)
-        values = array.read(0, array.shape[0])
-        if row.kind == "class":
-            return pictures.paint_classes(cloud, values, row.classes)
+    paint: Paint
+    if row.kind == "class":
+        paint = partial(drawing.classes, prefix=row.storage_prefix, known=row.classes)
+    else:
         column = 0 if class_value is None else known.index(class_value)
-        return pictures.paint_probability(cloud, values.reshape(len(values), -1)[:, column], limits)
-
+        paint = partial(drawing.probability, prefix=row.storage_prefix, column=column, limits=limits)
     parameters = ["label", row.storage_prefix, class_value, limits]
-    return previews.picture(cloud_id, grid, size, paint, parameters)
+    return await previews.picture(cloud_id, grid, size, paint, parameters)
+
+
+def _label_row(context: AppContext, clouds: OpenClouds, cloud_id: str, name: str, version: int | None) -> LabelVersion:
+    clouds.record(cloud_id)
+    with context.database.session() as session:
+        return find_label(session, cloud_id, name, version)
 
 
 def _limits(low: float | None, high: float | None) -> tuple[float, float] | None:

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 from specimap_core.arrays import Array
 from specimap_core.cloud import Cloud, Flag
+from specimap_core.cloud.outline import rows_crossed
 from specimap_service.array_responses import Columns
 from specimap_service.errors import RequestInvalidError
 
@@ -19,7 +20,13 @@ MOST_POINTS = 100_000
 MOST_JSON_POINTS = 10_000
 PAGE, JSON_PAGE = 10_000, 2_000
 """Points of a page where the request gives no limit."""
+MOST_VALUES, MOST_JSON_VALUES = 40_000_000, 4_000_000
+"""Values of one page, points times bands: with more bands than usual a page has fewer points."""
 MOST_VERTICES = 10_000
+MOST_CROSSINGS = 1_000_000
+"""Rows that the edges of a polygon cross, all together: a hundred times what an outline drawn by hand has."""
+ROUND_VALUES = 2**22
+"""Stored values that are read together, 8 MiB: points in any order touch each chunk once a round, not once a batch."""
 
 FieldName = Literal["xyz", "normal", "rgb", "hsi_pixel", "sigma_mm", "flags", "distance_mm"]
 Place = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
@@ -105,8 +112,18 @@ class Bands(_OneOf):
         default=None, description="Bands from the first to the second wavelength, both included."
     )
     indices: list[_Number] | None = Field(
-        default=None, min_length=1, max_length=65536, fail_fast=True, description="Bands by number, in this order."
+        default=None,
+        min_length=1,
+        max_length=65536,
+        fail_fast=True,
+        description="Bands by number, in this order, each once.",
     )
+
+    @model_validator(mode="after")
+    def _once(self) -> Self:
+        if self.indices is not None and len(set(self.indices)) < len(self.indices):
+            raise ValueError("indices names a band twice; give each once")
+        return self
 
 
 class SpectraRequest(_Strict):
@@ -209,6 +226,7 @@ def selected(cloud: Cloud, select: Select) -> Selection:
         found = cloud.at_pixels(np.array(select.pixels))
         return Selection(found[found >= 0])
     if select.polygon is not None:
+        _check_outline(cloud, select.polygon)
         return Selection(cloud.in_polygon(select.polygon))
     if select.nearest is not None:
         return Selection(cloud.nearest(select.nearest.xyz, select.nearest.k)[0], select.nearest.xyz)
@@ -216,6 +234,16 @@ def selected(cloud: Cloud, select: Select) -> Selection:
         return Selection(cloud.in_box(select.box.low, select.box.high))
     assert select.radius is not None
     return Selection(cloud.in_radius(select.radius.centre, select.radius.radius_mm), select.radius.centre)
+
+
+def _check_outline(cloud: Cloud, polygon: list[tuple[float, float]]) -> None:
+    crossed = rows_crossed(np.asarray(polygon, np.float64), int(cloud.hsi_pixel[:, 0].max(initial=0)))
+    if crossed > MOST_CROSSINGS:
+        raise RequestInvalidError(
+            f"The polygon's edges cross {crossed} rows of pixels, more than any outline does.",
+            advice=f"Give an outline with fewer turns: its edges may cross {MOST_CROSSINGS} rows all together.",
+            limit=MOST_CROSSINGS,
+        )
 
 
 def band_numbers(cloud: Cloud, bands: Bands | None) -> NDArray[np.intp] | None:
@@ -255,6 +283,8 @@ def listed_bands(text: str | None) -> Bands | None:
                 "query.bands: a range is empty, or there are too many.", advice="Give numbers as in 0,5,10-20."
             )
         numbers += wanted
+    if len(set(numbers)) < len(numbers):
+        raise RequestInvalidError("query.bands: a band is named twice.", advice="Give each band once.")
     return Bands(indices=numbers)
 
 
@@ -272,6 +302,28 @@ def _checked_numbers(numbers: list[int], limit: int, what: str) -> NDArray[np.in
 # ---- values -------------------------------------------------------------------------------------------
 
 
+class PointSpectra:
+    """Spectra of points in any order, read a round at a time as the rows are asked for."""
+
+    def __init__(self, cloud: Cloud, points: NDArray[np.intp], bands: NDArray[np.intp] | None) -> None:
+        self._cloud, self._points, self._bands = cloud, points, bands
+        self.width = cloud.bands if bands is None else len(bands)
+        self._round = max(1, ROUND_VALUES // max(self.width, 1))
+        self._start, self._stored = 0, np.empty((0, self.width), np.uint16)
+
+    def __len__(self) -> int:
+        return len(self._points)
+
+    def read(self, start: int, stop: int) -> NDArray[np.float32]:
+        """Return decoded spectra (stop - start, bands) of some of the points. Raises CloudDamagedError."""
+        if not self._start <= start <= stop <= self._start + len(self._stored):
+            end = max(stop, min(start + self._round, len(self._points)))
+            # The old round goes first: two of them are never in memory.
+            self._stored = np.empty((0, self.width), np.uint16)
+            self._start, self._stored = start, self._cloud.stored_spectra(self._points[start:end], self._bands)
+        return self._cloud.decode(self._stored[start - self._start : stop - self._start])
+
+
 def field_values(cloud: Cloud, selection: Selection, name: FieldName, part: slice) -> Array:
     """Return values (n,) or (n, m) of a field for a part of the selected points."""
     points = selection.indices[part]
@@ -281,14 +333,14 @@ def field_values(cloud: Cloud, selection: Selection, name: FieldName, part: slic
 
 
 def columns_of(
-    cloud: Cloud, selection: Selection, bands: NDArray[np.intp] | None, fields: list[FieldName], part: slice
+    cloud: Cloud, page: Selection, spectra: PointSpectra, fields: list[FieldName], start: int, stop: int
 ) -> Columns:
-    """Return the columns of an Arrow stream: index, the fields, spectrum."""
-    points = selection.indices[part]
+    """Return the columns of an Arrow stream for some points of a page: index, the fields, spectrum."""
+    part = slice(start, stop)
     return {
-        "index": points.astype(np.uint32),
-        **{name: field_values(cloud, selection, name, part) for name in fields},
-        "spectrum": cloud.spectra(points, bands),
+        "index": page.indices[part].astype(np.uint32),
+        **{name: field_values(cloud, page, name, part) for name in fields},
+        "spectrum": spectra.read(start, stop),
     }
 
 

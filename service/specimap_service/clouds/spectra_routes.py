@@ -16,24 +16,31 @@ from specimap_service.array_responses import (
     ARROW,
     JSON,
     NPY,
+    Pace,
+    Rows,
     arrow_answer,
     chosen_type,
     documented_responses,
     json_answer,
+    json_rows_answer,
     npy_answer,
 )
 from specimap_service.auth.dependencies import Reader
 from specimap_service.auth.object_ids import CloudId
 from specimap_service.body_limits import parsed
 from specimap_service.byte_ranges import CACHED, known_to_client
-from specimap_service.clouds.dependencies import CloudsDep, ParsingDep
-from specimap_service.clouds.open_clouds import CloudRecord
+from specimap_service.clouds.dependencies import CloudsDep, ReadingDep
+from specimap_service.clouds.open_clouds import CloudRecord, OpenClouds
 from specimap_service.clouds.spectra import (
     JSON_PAGE,
     MOST_JSON_POINTS,
+    MOST_JSON_VALUES,
+    MOST_VALUES,
     PAGE,
     BandAnswer,
     Point,
+    PointSpectra,
+    Selection,
     SpectraAnswer,
     SpectraRequest,
     band_numbers,
@@ -92,8 +99,8 @@ BODY: dict[str, Any] = {
 }
 
 
-async def _wanted(request: Request, limiter: ParsingDep) -> SpectraRequest:
-    return await parsed(request, SpectraRequest, limiter)
+async def _wanted(principal: Reader, request: Request, reading: ReadingDep) -> SpectraRequest:
+    return await parsed(request, SpectraRequest, reading.parses, principal.key_id)
 
 
 @router.post(
@@ -102,9 +109,10 @@ async def _wanted(request: Request, limiter: ParsingDep) -> SpectraRequest:
     responses=documented_responses(SpectraAnswer),
     openapi_extra=BODY,
 )
-def read_spectra(
+async def read_spectra(
     principal: Reader,
     clouds: CloudsDep,
+    reading: ReadingDep,
     request: Request,
     cloud_id: CloudId,
     wanted: Annotated[SpectraRequest, Depends(_wanted)],
@@ -115,48 +123,65 @@ def read_spectra(
     metadata. NumPy: the spectra alone, float32 (points, bands). `X-Specimap-Total` counts the whole selection,
     `X-Specimap-Next-Offset` is present if there is another page.
     """
-    media = chosen_type(request)
-    limit = min(wanted.limit or JSON_PAGE, MOST_JSON_POINTS) if media == JSON else wanted.limit or PAGE
+    key, media = principal.key_id, chosen_type(request)
+    return await reading.run(key, _spectra, clouds, cloud_id, wanted, media, reading.pace(key))
+
+
+def _spectra(clouds: OpenClouds, cloud_id: str, wanted: SpectraRequest, media: str, pace: Pace) -> Response:
     with clouds.reading(cloud_id) as (record, cloud):
         numbers, selection = band_numbers(cloud, wanted.bands), selected(cloud, wanted.select)
+        width = cloud.bands if numbers is None else len(numbers)
         total, start = len(selection.indices), wanted.offset
-        stop = min(start + limit, total)
-        rows = max(0, stop - start)
-        headers = {"X-Specimap-Total": str(total)}
+        stop = min(start + _page_points(wanted.limit, width, json=media == JSON), total)
+        page = Selection(selection.indices[start:stop].copy(), selection.centre)
+        spectra, rows = PointSpectra(cloud, page.indices, numbers), len(page.indices)
+        fields, headers = wanted.fields, {"X-Specimap-Total": str(total)}
         if stop < total:
             headers["X-Specimap-Next-Offset"] = str(stop)
         if media == NPY:
-            width = cloud.bands if numbers is None else len(numbers)
-
-            def spectra(a: int, b: int) -> Array:
-                return cloud.spectra(selection.indices[start + a : start + b], numbers)
-
-            return npy_answer((rows, width), spectra, headers)
+            return npy_answer((rows, width), spectra.read, headers, pace)
         if media == ARROW:
             return arrow_answer(
                 rows,
-                lambda a, b: columns_of(cloud, selection, numbers, wanted.fields, slice(start + a, start + b)),
+                lambda a, b: columns_of(cloud, page, spectra, fields, a, b),
                 _metadata(record, total=total, offset=start, **_described(cloud, numbers)),
                 headers,
+                width,
+                pace,
             )
-        page = slice(start, stop)
-        return json_answer(
+        return json_rows_answer(
             {
                 "total": total,
                 "offset": start,
                 "next_offset": stop if stop < total else None,
                 **_described(cloud, numbers),
-                "indices": selection.indices[page],
-                "spectra": cloud.spectra(selection.indices[page], numbers),
-                "fields": {name: field_values(cloud, selection, name, page) for name in wanted.fields},
+                "indices": page.indices,
             },
+            "spectra",
+            Rows(rows, width, spectra.read),
+            {"fields": {name: field_values(cloud, page, name, slice(None)) for name in fields}},
             headers,
+            pace,
         )
 
 
+def _page_points(limit: int | None, width: int, *, json: bool) -> int:
+    """Return the most points of a page: as asked for, but for bounds on points, and on points times bands."""
+    if json:
+        return max(1, min(limit or JSON_PAGE, MOST_JSON_POINTS, MOST_JSON_VALUES // max(width, 1)))
+    return max(1, min(limit or PAGE, MOST_VALUES // max(width, 1)))
+
+
 @router.get("/clouds/{cloud_id}/bands/{band}", response_model=BandAnswer, responses=documented_responses(BandAnswer))
-def read_band(principal: Reader, clouds: CloudsDep, request: Request, cloud_id: CloudId, band: Number) -> Response:
+async def read_band(
+    principal: Reader, clouds: CloudsDep, reading: ReadingDep, request: Request, cloud_id: CloudId, band: Number
+) -> Response:
     """Return one band of all points, in their order. Arrow: column `value`; NumPy: float32 (points,)."""
+    key = principal.key_id
+    return await reading.run(key, _band, clouds, cloud_id, band, request, reading.pace(key))
+
+
+def _band(clouds: OpenClouds, cloud_id: str, band: int, request: Request, pace: Pace) -> Response:
     media = chosen_type(request)
     with clouds.reading(cloud_id) as (record, cloud):
         if band >= cloud.bands:
@@ -172,20 +197,14 @@ def read_band(principal: Reader, clouds: CloudsDep, request: Request, cloud_id: 
         values = cloud.band(band)
         described = _described(cloud, np.array([band]))
         if media == NPY:
-            return npy_answer((len(values),), lambda a, b: values[a:b], headers)
+            return npy_answer((len(values),), lambda a, b: values[a:b], headers, pace)
         if media == ARROW:
             return arrow_answer(
-                len(values), lambda a, b: {"value": values[a:b]}, _metadata(record, **described), headers
+                len(values), lambda a, b: {"value": values[a:b]}, _metadata(record, **described), headers, pace=pace
             )
-        return json_answer(
-            {
-                "band": band,
-                "wavelength_nm": float(described["wavelength_nm"][0]),
-                "quantity": cloud.quantity,
-                "values": values,
-            },
-            headers,
-        )
+        before = {"band": band, "wavelength_nm": float(described["wavelength_nm"][0]), "quantity": cloud.quantity}
+        rows = Rows(len(values), 1, lambda a, b: values[a:b])
+        return json_rows_answer(before, "values", rows, headers=headers, pace=pace)
 
 
 def _described(cloud: Cloud, numbers: Array | None) -> dict[str, Any]:

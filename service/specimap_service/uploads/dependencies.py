@@ -11,7 +11,7 @@ from fastapi import Depends, FastAPI
 
 from specimap_core.errors import SpecimapError
 from specimap_infra.logs import logger
-from specimap_service.acquisitions.dependencies import JUDGE, UNFINISHED_UPLOADS
+from specimap_service.acquisitions.dependencies import INTAKE, JUDGE, UNFINISHED_UPLOADS
 from specimap_service.app_state import AppState
 from specimap_service.context import AppContext
 from specimap_service.feature import Feature
@@ -24,7 +24,7 @@ UPLOADS = AppState[Uploads]("uploads")
 
 def _open(app: FastAPI, context: AppContext) -> None:
     files = UploadFiles(context.settings.scratch / "uploads")
-    UPLOADS.set(app, Uploads(context, files, JUDGE.of(app)))
+    UPLOADS.set(app, Uploads(context, files, JUDGE.of(app), INTAKE.of(app)))
     UNFINISHED_UPLOADS.set(app, files)
 
 

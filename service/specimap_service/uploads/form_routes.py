@@ -99,7 +99,12 @@ async def add_files(
     try:
         parts = await form.read(request)
         context.metrics.uploaded.inc(sum(part.size for part in parts))
-        return await asyncio.to_thread(_store, uploads, principal, acquisition_id, parts)
+        stored: list[File] = []
+        for part in parts:
+            # The first may be refused; those after it wait, so that a form does not end half stored.
+            run = uploads.intake.go_on if stored else uploads.intake.run
+            stored.append(await run(principal.key_id, _store, uploads, principal, acquisition_id, part, stored))
+        return stored
     finally:
         await asyncio.to_thread(form.close)
 
@@ -123,25 +128,22 @@ def _limits(context: AppContext, principal: Principal, request: Request, acquisi
     return _FormLimits(context, acquisition_id, left)
 
 
-def _store(uploads: Uploads, principal: Principal, acquisition_id: str, parts: list[Part]) -> list[File]:
-    stored: list[File] = []
-    for part in parts:
-        if not part.size:
-            raise RequestInvalidError("A file is empty.", advice="Send the file itself.", stored=[f.id for f in stored])
-        row = take_in(
-            uploads.context,
-            uploads.judge,
-            Arrival(
-                new_id("file"),
-                acquisition_id,
-                part.role,
-                clean_name(part.name),
-                part.path,
-                part.size,
-                part.sha256,
-                principal.key_id,
-                principal,
-            ),
-        )
-        stored.append(File.model_validate(row))
-    return stored
+def _store(uploads: Uploads, principal: Principal, acquisition_id: str, part: Part, before: list[File]) -> File:
+    if not part.size:
+        raise RequestInvalidError("A file is empty.", advice="Send the file itself.", stored=[f.id for f in before])
+    row = take_in(
+        uploads.context,
+        uploads.judge,
+        Arrival(
+            new_id("file"),
+            acquisition_id,
+            part.role,
+            clean_name(part.name),
+            part.path,
+            part.size,
+            part.sha256,
+            principal.key_id,
+            principal,
+        ),
+    )
+    return File.model_validate(row)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import sqlalchemy as sa
+from fastapi.concurrency import run_in_threadpool
 from sqlalchemy.orm import Session
 
 from specimap_core.atomic import disk_errors, remove
@@ -31,6 +32,7 @@ from specimap_service.auth.access import load, no_upload
 from specimap_service.auth.keys import Principal
 from specimap_service.context import AppContext, audit
 from specimap_service.errors import ForbiddenError, RequestInvalidError, UploadGoneError
+from specimap_service.fair_turns import FairTurns
 from specimap_service.space import check_disks, check_quota
 from specimap_service.uploads.files import UploadFiles
 
@@ -43,11 +45,12 @@ SERVICE = "service"
 
 @dataclass(frozen=True)
 class Uploads:
-    """The uploads of the app, their rows and their bytes. All methods block: call them from a thread."""
+    """The uploads of the app, their rows and their bytes. All but the coroutines block: call these from a thread."""
 
     context: AppContext
     files: UploadFiles
     judge: Judge
+    intake: FairTurns
 
     def create(self, principal: Principal, metadata: Mapping[str, str], size: int | None) -> Upload:
         """Create an upload after checking that its file fits.
@@ -111,14 +114,26 @@ class Uploads:
             raise
         return upload
 
-    def current(self, upload_id: str, principal: Principal) -> Upload:
+    async def current(self, upload_id: str, principal: Principal) -> Upload:
         """Return the upload as it stands; finish one whose last byte arrived in a process that died.
 
         Raises:
             NotFoundError: there is none in the key's project.
             ForbiddenError: another key of the project created it.
             UploadGoneError: it expired or was ended.
+            TooManyAtOnceError, OverloadedError: it is whole, and too many files wait to be judged.
         """
+        upload, whole = await run_in_threadpool(self._current, upload_id, principal)
+        return await self.finish_in_turn(upload) if whole else upload
+
+    async def finish_in_turn(self, upload: Upload) -> Upload:
+        """Finish an upload that has arrived whole, as :meth:`finish` does, in a turn of its key.
+
+        Raises TooManyAtOnceError and OverloadedError besides: the next request tries again; the bytes are kept.
+        """
+        return await self.intake.run(upload.created_by, self.finish, upload.id)
+
+    def _current(self, upload_id: str, principal: Principal) -> tuple[Upload, bool]:
         self.files.path(upload_id)
         with self.context.database.session() as session:
             upload = load(session, principal, Upload, upload_id)
@@ -127,11 +142,11 @@ class Uploads:
                 "Another key created this upload.", advice="Use that key, or one with the scope admin."
             )
         if upload.state == "open" and self.files.size(upload_id) == upload.size:
-            return self.finish(upload_id)
+            return upload, True
         if upload.state == "open" and upload.expires_at <= utc_now():
             self.expire(upload_id)
             upload.state = "expired"
-        return upload
+        return upload, False
 
     def renewed(self, upload: Upload) -> Upload:
         """Return the upload as it stands now, where another request has finished or ended it since it was read."""

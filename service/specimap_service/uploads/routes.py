@@ -5,14 +5,17 @@ from __future__ import annotations
 from typing import Literal, cast
 
 from fastapi import APIRouter, Response
+from fastapi.concurrency import run_in_threadpool
 from pydantic import BaseModel, Field
 
+from specimap_infra.tables import Upload
 from specimap_service.acquisitions.schemas import File
 from specimap_service.auth.dependencies import Uploader
 from specimap_service.auth.object_ids import UploadId
 from specimap_service.context import Context
 from specimap_service.uploads import tus
 from specimap_service.uploads.dependencies import UploadsDep
+from specimap_service.uploads.lifecycle import Uploads
 
 router = APIRouter(prefix="/v1", tags=["uploads"])
 State = Literal["open", "finished", "failed", "expired", "terminated"]
@@ -38,9 +41,14 @@ class UploadResult(BaseModel):
 
 
 @router.get("/uploads/{upload_id}/result")
-def get_result(principal: Uploader, uploads: UploadsDep, upload_id: UploadId) -> UploadResult:
+async def get_result(principal: Uploader, uploads: UploadsDep, upload_id: UploadId) -> UploadResult:
     """Return the state of an upload; for a finished one its file, with the judgement and advice on retaking it."""
-    upload = uploads.renewed(uploads.current(upload_id, principal))
+    upload = await uploads.current(upload_id, principal)
+    return await run_in_threadpool(_result, uploads, upload)
+
+
+def _result(uploads: Uploads, upload: Upload) -> UploadResult:
+    upload = uploads.renewed(upload)
     stored = uploads.stored_file(upload)
     return UploadResult(
         id=upload.id,

@@ -8,6 +8,7 @@ from collections.abc import Awaitable, Callable
 from typing import Annotated, Any
 
 from fastapi import Depends, FastAPI, Request, Response
+from fastapi.concurrency import run_in_threadpool
 from fastapi.routing import APIRoute
 from starlette.exceptions import HTTPException
 from tuspyserver import create_tus_router
@@ -28,7 +29,7 @@ OCTETS = "application/offset+octet-stream"
 # ---- before the library sees a request ----------------------------------------------------------------
 
 
-def _check_request(request: Request, principal: Uploader, uploads: UploadsDep) -> None:
+async def _check_request(request: Request, principal: Uploader, uploads: UploadsDep) -> None:
     """Check before the body is read whatever can be checked then; the library checks most of it afterwards."""
     exchange, headers = tus.exchange(), request.headers
     exchange.principal = principal
@@ -37,9 +38,10 @@ def _check_request(request: Request, principal: Uploader, uploads: UploadsDep) -
     if request.method == "POST":
         _check_creation(request)
         return
-    upload = exchange.upload = uploads.current(request.path_params["uuid"], principal)
+    upload = exchange.upload = await uploads.current(request.path_params["uuid"], principal)
     check_alive(upload)
-    _add_result_headers(uploads, upload, exchange)
+    if upload.state != "open":
+        await run_in_threadpool(_add_result_headers, uploads, upload, exchange)
     if request.method == "HEAD":
         given = {"acquisition": upload.acquisition_id, "role": upload.role, "filename": upload.name}
         exchange.headers["Upload-Metadata"] = ",".join(f"{key} {_base64(value)}" for key, value in given.items())
@@ -114,7 +116,7 @@ def _completion_hook(uploads: UploadsDep) -> Callable[[str, dict[str, str]], Awa
     async def complete(upload_id: str, metadata: dict[str, str]) -> None:
         exchange = tus.exchange()
         if exchange.upload is not None and exchange.upload.state == "open":
-            exchange.upload = await asyncio.to_thread(uploads.finish, upload_id)
+            exchange.upload = await uploads.finish_in_turn(exchange.upload)
         if exchange.upload is not None:
             await asyncio.to_thread(_add_result_headers, uploads, exchange.upload, exchange)
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from specimap_core.errors import PhotoRawError, PhotoUnreadableError
-from specimap_core.photos.decoding import decode_photo
+from specimap_core.errors import PhotoRawError, PhotoTooLargeError, PhotoUnreadableError
+from specimap_core.photos.decoding import check_pixels, decode_photo
 from specimap_core.photos.folder import photo_paths
 from specimap_core.photos.formats import FORMATS
 from specimap_core.photos.reading import AcquisitionSettings, read_photo, read_photos
@@ -115,3 +115,29 @@ def test_a_photo_that_may_not_be_read_says_so(tmp_path: Path, monkeypatch: pytes
     with pytest.raises(PhotoUnreadableError, match="Permission denied") as refused:
         read_photo(path, SETTINGS)
     assert "account" in refused.value.advice
+
+
+def test_what_would_be_decoded_whole_is_measured_by_its_header(tmp_path: Path) -> None:
+    picture = Image.fromarray(pattern(400, 300))
+    for name, options, whole in (
+        ("a.png", {}, True),
+        ("a.tif", {}, True),
+        ("a.webp", {}, True),
+        ("a.jpg", {"progressive": True}, True),
+        ("b.jpg", {}, False),
+    ):
+        path = tmp_path / name
+        picture.save(path, **options)
+        check_pixels(path, 400 * 300)
+        if not whole:
+            check_pixels(path, 1000)
+            continue
+        with pytest.raises(PhotoTooLargeError, match="400 x 300 pixels") as refused:
+            check_pixels(path, 400 * 300 - 1)
+        assert refused.value.details["limit_pixels"] == 400 * 300 - 1
+        assert refused.value.advice
+        if name == "a.png":  # the rest of the file need not even be there
+            path.write_bytes(path.read_bytes()[:1000])
+        verdict = judge_photo(path, "DICT_4X4_50", Others(), 1000)
+        assert (verdict.verdict, verdict.code) == ("refused", "photo_too_large"), name
+        assert verdict.reason.startswith("The photo has 400 x 300 pixels")
