@@ -18,7 +18,8 @@ from specimap_service.auth.dependencies import Reader
 from specimap_service.auth.object_ids import CloudId
 from specimap_service.byte_ranges import CACHED, REVALIDATED, ranged_bytes, ranged_response
 from specimap_service.clouds.dependencies import CloudsDep
-from specimap_service.clouds.open_clouds import CloudRecord, StoredFolder
+from specimap_service.clouds.open_clouds import CloudRecord
+from specimap_service.clouds.stored_folder import StoredFolder
 from specimap_service.context import Context
 
 router = APIRouter(prefix="/v1", tags=["zarr"])
