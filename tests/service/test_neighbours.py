@@ -14,6 +14,7 @@ from pathlib import Path
 
 import httpx
 import pytest
+import uvicorn
 
 from specimap_core.threads import NICENESS
 from specimap_infra.settings import load_settings
@@ -220,7 +221,9 @@ def test_a_drawing_process_that_dies_costs_one_picture(tmp_path: Path) -> None:
     # A process of its own, which hears of the ends of its children as the real service does.
     with process_serving(tmp_path) as (process, url):
         settings = load_settings(data_dir=tmp_path)
-        service = Running(url, settings, create_app(settings))
+        app = create_app(settings)
+        # Only its settings and database: the process serves.
+        service = Running(url, settings, app, uvicorn.Server(uvicorn.Config(app)))
         result, client = put_result(service, tmp_path / "result"), service.client(["read"])
         assert previews(client, result, 100).status_code == 200
         (pid,) = _drawing_processes(process.pid)

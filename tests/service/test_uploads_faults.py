@@ -222,15 +222,15 @@ def test_another_request_finishes_the_upload_meanwhile(
     """Between the look at its row and the lock of its file."""
     client, first = service.client(), service.client()
     at = created(client, new_acquisition(client), "photo", len(PHOTO))
-    look = Uploads.current
+    look = Uploads._current
 
-    def overtaken(self: Uploads, upload_id: str, principal: Principal) -> Upload:
+    def overtaken(self: Uploads, upload_id: str, principal: Principal) -> tuple[Upload, bool]:
         found = look(self, upload_id, principal)
-        monkeypatch.setattr(Uploads, "current", look)
+        monkeypatch.setattr(Uploads, "_current", look)
         assert patch(first, at, PHOTO, 0).status_code == 204
         return found
 
-    monkeypatch.setattr(Uploads, "current", overtaken)
+    monkeypatch.setattr(Uploads, "_current", overtaken)
     if ask == "HEAD":
         assert offset_of(client, at) == len(PHOTO)
     elif ask == "DELETE":
@@ -255,15 +255,15 @@ def test_another_request_finishes_the_upload_meanwhile(
 def test_an_upload_that_is_ended_meanwhile_is_gone(service: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     client, first = service.client(), service.client()
     at = created(client, new_acquisition(client), "photo", len(PHOTO))
-    look = Uploads.current
+    look = Uploads._current
 
-    def overtaken(self: Uploads, upload_id: str, principal: Principal) -> Upload:
+    def overtaken(self: Uploads, upload_id: str, principal: Principal) -> tuple[Upload, bool]:
         found = look(self, upload_id, principal)
-        monkeypatch.setattr(Uploads, "current", look)
+        monkeypatch.setattr(Uploads, "_current", look)
         assert first.delete(at, headers=TUS).status_code == 204
         return found
 
-    monkeypatch.setattr(Uploads, "current", overtaken)
+    monkeypatch.setattr(Uploads, "_current", overtaken)
     answer = patch(client, at, PHOTO, 0)
     assert (answer.status_code, answer.json()["code"]) == (410, "upload_gone")
 
