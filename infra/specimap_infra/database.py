@@ -99,7 +99,7 @@ def _unavailable(error: Exception) -> DatabaseUnavailableError:
     )
 
 
-def database_seconds(engine: sa.Engine) -> sa.ColumnElement[float]:
+def database_seconds(engine: sa.Engine | sa.Connection) -> sa.ColumnElement[float]:
     """Return the current time in seconds by the database's clock, which all machines share."""
     if engine.dialect.name == "sqlite":
         return sa.literal_column("((julianday('now') - 2440587.5) * 86400.0)", sa.Float())
