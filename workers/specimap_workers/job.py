@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import shutil
 import time
 import uuid
 from collections.abc import Callable
@@ -24,7 +23,7 @@ from specimap_infra.ids import new_id
 from specimap_infra.logs import logger
 from specimap_infra.setbacks import Setbacks, pause_seconds
 from specimap_infra.settings import ServiceSettings
-from specimap_infra.storage import Storage
+from specimap_infra.storage import Storage, link
 from specimap_infra.tables import CloudRow, Job
 from specimap_workers.artefacts import SAVED, Artefacts
 from specimap_workers.executors import suffix_of
@@ -119,8 +118,11 @@ class JobRun:
         seconds = {o["stage"]: float(o["seconds"]) for o in outcomes if "seconds" in o}
         report = None
         if error is None:
-            text = await self._thread(self._storage.read, f"{outcomes[-1]['prefix']}/report.json")
-            report = Report.model_validate_json(text)
+            try:
+                text = await self._thread(self._storage.read, f"{outcomes[-1]['prefix']}/report.json")
+                report = Report.model_validate_json(text)
+            except SpecimapError as away:
+                error = away.as_dict()
 
         def end() -> str:
             with self._database.session() as session:
@@ -189,7 +191,8 @@ class JobRun:
     def _publish(self, prefix: str) -> tuple[int, int]:
         with self._storage.publishing(prefix) as aside, disk_errors(aside):
             for name in (*RESULTS, *([SHEET] if (self._out / SHEET).exists() else [])):
-                shutil.move(self._out / name, aside / name)
+                # Linked, not moved: where the storage is away, this is done again.
+                link(self._out / name, aside / name)
             size = sum(p.stat().st_size for p in aside.rglob("*") if p.is_file())
             # Read here, where the cloud is on the local disk: the report does not hold it.
             from specimap_core.cloud import Cloud
@@ -246,7 +249,7 @@ class JobRun:
             try:
                 await asyncio.to_thread(self._report_progress, stage, share)
             except DatabaseUnavailableError:
-                logger().warning("progress not written: the database is away", job=self.job_id, stage=stage)
+                logger().debug("progress not written: the database is away", job=self.job_id, stage=stage)
 
         return await process.run(spec, progress, self._settings.stage_seconds)
 

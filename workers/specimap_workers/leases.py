@@ -81,8 +81,8 @@ class LeaseKeeper:
                     settled = now
                     self._settle()
             except DatabaseUnavailableError:
+                # The log tells once that it is away.
                 steady = None
-                logger().warning("heartbeat missed: the database is away", executor=self._executor)
             except Exception:
                 # This thread must outlive any error: without it the worker would count as dead.
                 logger().exception("looking after others failed", executor=self._executor)

@@ -13,8 +13,9 @@ from specimap_infra.logs import logger
 from specimap_workers.executors import new_executor
 
 FIRST_PAUSE = 0.2
-LONGEST_PAUSE = 10.0
-STEADY_SECONDS = 30.0
+LONGEST_PAUSE = 5.0
+"""So long, and a start, a job may wait for the one worker there is."""
+STEADY_SECONDS = 15.0
 """A worker that has lived so long is started again at once."""
 GRACE_SECONDS = 10.0
 

@@ -13,7 +13,7 @@ from dbos import DBOS, DBOSConfig
 
 from specimap_core.errors import SpecimapError
 from specimap_core.reconstruct.backends.environment import BackendSettings
-from specimap_infra.database import Database, database_errors
+from specimap_infra.database import Database, database_errors, make_engine
 from specimap_infra.errors import DatabaseUnavailableError, LostLeaseError
 from specimap_infra.logs import logger
 from specimap_infra.migrate import migrate
@@ -145,6 +145,8 @@ class Worker:
                     self._sweep()
                 try:
                     deliver_due(self._database, self.settings, client)
+                except DatabaseUnavailableError:
+                    pass  # they are delivered once it is back; the log tells that it is away
                 except SpecimapError as error:
                     logger().warning("webhooks not delivered", code=error.code)
 
@@ -161,6 +163,9 @@ class Worker:
             "log_level": "WARNING",
             "console_log_level": "ERROR",
         }
+        if self._database.engine.dialect.name != "sqlite":
+            # Of its own, since it holds connections for long; with limits to its waits, which the engine's have not.
+            config["system_database_engine"] = make_engine(self.settings.database)
         DBOS(config=config)
 
     def _register(self) -> None:
