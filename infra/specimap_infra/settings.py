@@ -116,7 +116,7 @@ class ServiceSettings(BaseSettings):
     patience_seconds: float = Field(
         default=300,
         gt=0,
-        description="How long a worker waits for an unreachable database or storage before it gives up a job.",
+        description="How long a worker waits for an unreachable storage before it gives up a job; for the database it waits without end.",
     )
 
     webhook_hosts: list[str] = Field(

@@ -25,7 +25,7 @@ def patience(storage_seconds: float) -> tenacity.Retrying:
 
     return tenacity.Retrying(
         retry=tenacity.retry_if_exception_type((DatabaseUnavailableError, StorageUnavailableError)),
-        wait=tenacity.wait_exponential_jitter(initial=0.2, max=LONGEST_WAIT_SECONDS),
+        wait=tenacity.wait_exponential_jitter(multiplier=0.2, max=LONGEST_WAIT_SECONDS),
         stop=given_up,
         reraise=True,
     )
@@ -39,7 +39,7 @@ def at_start() -> tenacity.Retrying:
     """Make what calls a function until nothing of ``PASSING`` stops it; the log has a line for each time."""
     return tenacity.Retrying(
         retry=tenacity.retry_if_exception_type(PASSING),
-        wait=tenacity.wait_exponential_jitter(initial=0.2, max=LONGEST_WAIT_SECONDS),
+        wait=tenacity.wait_exponential_jitter(multiplier=0.2, max=LONGEST_WAIT_SECONDS),
         before_sleep=_say,
         reraise=True,
     )
