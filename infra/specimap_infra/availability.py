@@ -15,8 +15,10 @@ from typing import Any
 from specimap_core.errors import SpecimapError
 from specimap_infra.logs import logger
 
+SLOW_SECONDS = 1.0
+"""A try that failed sooner held nobody up."""
 RETRY_SECONDS = 1.0
-"""How long after a failed try the next one may begin."""
+"""How long after a slow one that failed the next try may begin."""
 LONGEST_TRY_SECONDS = 30.0
 """How long a try may keep the next one off."""
 
@@ -40,17 +42,21 @@ class Availability:
         with self._lock:
             if self._away_since is None or not self._refuses:
                 return
+            if self._next_try == 0.0:
+                return
             now = time.monotonic()
             if now < self._next_try:
                 raise self._error()
             self._next_try = now + LONGEST_TRY_SECONDS
 
-    def failed(self, cause: BaseException) -> None:
-        """Note that a try has failed."""
+    def failed(self, cause: BaseException, seconds: float) -> None:
+        """Note that a try has failed, after so many seconds."""
+        now = time.monotonic()
         with self._lock:
             first = self._away_since is None
-            self._away_since = self._away_since or time.monotonic()
-            self._next_try = time.monotonic() + RETRY_SECONDS
+            self._away_since = self._away_since or now
+            # Where it fails at once everybody may try, and nobody is refused once it is back.
+            self._next_try = now + RETRY_SECONDS if seconds > SLOW_SECONDS else 0.0
         if first:
             logger().warning(f"the {self._name} is away", cause=first_line(cause))
 
@@ -72,11 +78,12 @@ class Availability:
     def trying(self, is_away: Callable[[BaseException], bool]) -> Iterator[None]:
         """Make a try of the block, which fails by the errors that ``is_away`` picks alone."""
         self.enter()
+        start = time.monotonic()
         try:
             yield
         except BaseException as error:
             if is_away(error):
-                self.failed(error)
+                self.failed(error, time.monotonic() - start)
             else:
                 self.unknown()
             raise
