@@ -69,7 +69,7 @@ def main() -> None:
     parser.add_argument("--slots", type=int, default=2, help="workers")
     parser.add_argument("--gap", type=float, default=3.0, help="mean seconds between two kills")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--minutes", type=float, default=60, help="longest run")
+    parser.add_argument("--minutes", type=float, default=60, help="longest time of kills; then the rest may end")
     parser.add_argument("--database-url", default="", help="an empty PostgreSQL database; by default SQLite")
     parser.add_argument("--photos", type=Path, default=SAMPLE / "rgb")
     parser.add_argument("--cube", type=Path, default=SAMPLE / "hsi" / "hsi.hdr")
@@ -107,6 +107,9 @@ def measure(settings: ServiceSettings, options: Namespace) -> dict[str, Any]:
         submitting.start()
         kills, deaths = kill_at_random(database, api, options)
         submitting.join(60)
+        deadline = time.monotonic() + options.minutes * 60
+        while not all_ended(database, options.jobs) and time.monotonic() < deadline:
+            time.sleep(0.5)
         seconds = time.monotonic() - start
     finally:
         supervisor.stop()
