@@ -132,11 +132,14 @@ def release(session: Session, job_id: str, executor: str, *, died: bool) -> Job 
 
 def take_back(session: Session, executor: str) -> None:
     """Take back that an executor died: it was silent for longer than its lease, and lives."""
-    for table in (Job, Export):
-        noted = sa.cast(table.setbacks, sa.String).contains(executor, autoescape=True)
-        query = sa.select(table).where(table.state.not_in(FINAL_STATES), noted).with_for_update()
-        for row in session.scalars(query):
-            row.setbacks = Setbacks.of(row.setbacks).without(executor).stored()
+    _take_back(session, Job, executor)
+    _take_back(session, Export, executor)
+
+
+def _take_back(session: Session, table: type[Job] | type[Export], executor: str) -> None:
+    noted = sa.cast(table.setbacks, sa.String).contains(executor, autoescape=True)
+    for row in session.scalars(sa.select(table).where(table.state.not_in(FINAL_STATES), noted).with_for_update()):
+        row.setbacks = Setbacks.of(row.setbacks).without(executor).stored()
 
 
 def may_go_on(session: Session, setbacks: Setbacks) -> bool:
@@ -145,9 +148,7 @@ def may_go_on(session: Session, setbacks: Setbacks) -> bool:
 
 
 def _now(session: Session) -> float:
-    now = session.scalar(sa.select(database_seconds(session.get_bind())))
-    assert now is not None
-    return now
+    return session.scalars(sa.select(database_seconds(session.get_bind()))).one()
 
 
 def fail_orphan(session: Session, job_id: str, error: Failure) -> Job | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import psycopg
 import sqlalchemy as sa
@@ -88,5 +88,5 @@ def unhurried(connection: sa.Connection) -> Iterator[None]:
     if not isinstance(driver, BoundedConnection):
         yield
         return
-    with cast("BoundedConnection", driver).unhurried():
+    with driver.unhurried():
         yield

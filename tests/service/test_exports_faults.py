@@ -21,7 +21,7 @@ from specimap_core.errors import CancelledError
 from specimap_infra.errors import StorageUnavailableError
 from specimap_infra.storage import Storage
 from specimap_infra.tables import CloudRow, Export
-from specimap_workers import exports
+from specimap_workers import export_rows, exports
 from specimap_workers.export_rows import claim, release_export
 from specimap_workers.exports import run_export
 from tests.support.export_scene import address, make
@@ -195,7 +195,7 @@ def test_a_worker_that_comes_too_late_takes_its_file_back(
     service: Running, client: httpx.Client, result: Result, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     export_id = client.post(address(result, "ply")).json()["id"]
-    finish = exports.finish
+    finish = export_rows.finish
 
     def late(*arguments: Any) -> bool:
         monkeypatch.undo()

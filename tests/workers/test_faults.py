@@ -16,6 +16,7 @@ import pytest
 from specimap_core.cloud import Cloud
 from specimap_core.pipeline.clock import STAGES
 from specimap_infra.setbacks import Setbacks
+from specimap_workers.executors import suffix_of
 from specimap_workers.stage_process import SPARES
 from tests.support.scenes import Finished, OnDisk
 from tests.support.worker_scene import Shop, processes_of, shop, until
@@ -160,7 +161,8 @@ def test_a_dead_worker_of_this_machine_is_found_before_its_lease_has_run_out(tmp
         until(partial(taken_from, yard, job_id, executor), TAKEOVER_SECONDS, "the takeover")
         yard.held("reconstruct")
         assert executor not in yard.leases()
-        until(lambda: not list((yard.settings.scratch / "work").glob(f"*{executor.split(':')[-1]}*")), 30, "a sweep")
+        assert executor is not None
+        until(lambda: not list((yard.settings.scratch / "work").glob(f"*{suffix_of(executor)}*")), 30, "a sweep")
 
 
 def test_a_frozen_worker_takes_its_interruption_back(yard: Shop, small: OnDisk) -> None:

@@ -9,7 +9,9 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
@@ -23,7 +25,7 @@ from tests.support.gate import Gate
 from tests.support.object_store import object_store
 from tests.support.scenes import Finished, OnDisk
 from tests.support.service_scene import serving
-from tests.support.worker_scene import QUICK, processes_of, shop, until
+from tests.support.worker_scene import QUICK, Shop, processes_of, shop, until
 
 pytestmark = pytest.mark.slow
 
@@ -36,8 +38,8 @@ class Behind:
     """A server behind a gate: the settings of who reaches it past the gate, and through it."""
 
     gate: Gate
-    past: dict[str, str]
-    through: dict[str, str]
+    past: dict[str, Any]
+    through: dict[str, Any]
 
     @contextmanager
     def away(self, how: str) -> Iterator[None]:
@@ -71,8 +73,12 @@ def behind(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> I
             yield Behind(gate, past, {**past, "s3_endpoint": f"http://127.0.0.1:{gate.port}"})
 
 
-def variables(settings: dict[str, str]) -> dict[str, str]:
+def variables(settings: dict[str, Any]) -> dict[str, str]:
     return {f"SPECIMAP_{name.upper()}": value for name, value in settings.items()}
+
+
+def in_stage(yard: Shop, job_id: str, stage: str) -> bool:
+    return yard.job(job_id).stage == stage
 
 
 @pytest.mark.parametrize("how", ["shut", "hang"])
@@ -84,7 +90,7 @@ def test_a_job_goes_on_after_an_outage_in_every_stage(
         yard.start(QUICK, **variables(behind.through), **options)
         job_id = yard.submit(yard.acquisition(small.photos, small.header))
         for stage in STAGES:
-            until(lambda stage=stage: yard.job(job_id).stage == stage, 60, f"stage {stage}")
+            until(partial(in_stage, yard, job_id, stage), 60, f"stage {stage}")
             with behind.away(how):
                 # The stage ends meanwhile, so that what it left is stored, or published, in the outage.
                 time.sleep(SECONDS[how])
@@ -95,7 +101,7 @@ def test_a_job_goes_on_after_an_outage_in_every_stage(
 
 @pytest.mark.parametrize("how", ["shut", "hang"])
 def test_the_api_answers_503_in_an_outage_and_is_ready_after_it(tmp_path: Path, behind: Behind, how: str) -> None:
-    with serving(tmp_path / "service", **behind.through) as service:
+    with serving(tmp_path / "service", own_judge=False, **behind.through) as service:
         client = service.client()
 
         def status(_: int = 0) -> tuple[int, str, str | None]:

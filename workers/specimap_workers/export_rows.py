@@ -41,8 +41,7 @@ def release_export(session: Session, export_id: str, executor: str, *, died: boo
     if export is not None and export.state == "running" and export.executor == executor:
         export.executor = None
         if died:
-            now = session.scalar(sa.select(database_seconds(session.get_bind())))
-            assert now is not None
+            now = session.scalars(sa.select(database_seconds(session.get_bind()))).one()
             export.setbacks = Setbacks.of(export.setbacks).interrupted(executor, now).stored()
     return export
 

@@ -83,8 +83,8 @@ def _run(
         return
     setbacks = Setbacks.of(export.setbacks)
     if setbacks.cause(crashes=settings.starts, interruptions=settings.interruptions) is not None:
-        failure = _crashed("The worker died", len(setbacks.interruptions), None)
-        finish(database, export_id, executor, {"state": "failed", "error": failure.as_dict()})
+        crashed = _crashed("The worker died", len(setbacks.interruptions), None)
+        finish(database, export_id, executor, {"state": "failed", "error": crashed.as_dict()})
         return
     workspaces = Workspaces.of(settings, settings.scratch, "tmp")
     workspace = workspaces.new(f"{export_id}-{uuid4().hex[:8]}")

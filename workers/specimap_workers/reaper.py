@@ -16,7 +16,7 @@ from specimap_infra.logs import logger
 from specimap_infra.queue import queue_client
 from specimap_infra.setbacks import Setbacks
 from specimap_infra.settings import ServiceSettings
-from specimap_infra.tables import FINAL_STATES, Job, Lease
+from specimap_infra.tables import FINAL_STATES, Export, Job, Lease
 from specimap_workers.export_rows import release_export
 
 SETTLED = datetime.timedelta(seconds=30)
@@ -53,8 +53,11 @@ class Reaper:
                 job = session.get(Job, workflow.workflow_id)
                 cancelled = job is not None and job.state in FINAL_STATES
                 if not cancelled:
-                    row = jobs.release(session, workflow.workflow_id, executor, died=died) if job else None
-                    row = row or release_export(session, workflow.workflow_id, executor, died=died)
+                    row: Job | Export | None
+                    if job is not None:
+                        row = jobs.release(session, workflow.workflow_id, executor, died=died)
+                    else:
+                        row = release_export(session, workflow.workflow_id, executor, died=died)
                     if row is not None and not jobs.may_go_on(session, Setbacks.of(row.setbacks)):
                         continue
             if cancelled:
