@@ -8,7 +8,7 @@ last, and a write by another, or after the end, changes nothing and raises LostL
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import sqlalchemy as sa
 from sqlalchemy.orm import Session
@@ -26,6 +26,7 @@ FinalState = Literal["succeeded", "failed", "cancelled"]
 Stage = Literal["reconstruct", "adjust", "render", "register"]
 EventType = Literal["state", "progress", "log"]
 Level = Literal["debug", "info", "warning", "error"]
+Worked = TypeVar("Worked", Job, Export)
 Failure = SpecimapError | dict[str, Any]
 """An error, or its ``as_dict`` from another process."""
 
@@ -132,14 +133,15 @@ def release(session: Session, job_id: str, executor: str, *, died: bool) -> Job 
 
 def take_back(session: Session, executor: str) -> None:
     """Take back that an executor died: it was silent for longer than its lease, and lives."""
-    _take_back(session, Job, executor)
-    _take_back(session, Export, executor)
-
-
-def _take_back(session: Session, table: type[Job] | type[Export], executor: str) -> None:
-    noted = sa.cast(table.setbacks, sa.String).contains(executor, autoescape=True)
-    for row in session.scalars(sa.select(table).where(table.state.not_in(FINAL_STATES), noted).with_for_update()):
+    rows: list[Job | Export] = [*session.scalars(_set_back_by(Job, executor))]
+    rows += session.scalars(_set_back_by(Export, executor))
+    for row in rows:
         row.setbacks = Setbacks.of(row.setbacks).without(executor).stored()
+
+
+def _set_back_by(table: type[Worked], executor: str) -> sa.Select[Worked]:
+    noted = sa.cast(table.setbacks, sa.String).contains(executor, autoescape=True)
+    return sa.select(table).where(table.state.not_in(FINAL_STATES), noted).with_for_update()
 
 
 def may_go_on(session: Session, setbacks: Setbacks) -> bool:
