@@ -115,8 +115,8 @@ def measure(settings: ServiceSettings, options: Namespace) -> dict[str, Any]:
         supervisor.stop()
         api.end()
     figures = count(database, deaths) | {"kills": dict(kills), "seconds": round(seconds, 1)}
-    figures |= {name: str(value) for name, value in vars(options).items() if name != "database_url"}
-    figures["database"] = database.engine.dialect.name
+    figures |= {name: getattr(options, name) for name in ("jobs", "slots", "gap", "seed", "minutes")}
+    figures |= {"database": database.engine.dialect.name, "real_stages": not options.stage_command}
     database.close()
     return figures
 
