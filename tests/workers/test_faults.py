@@ -144,7 +144,7 @@ def test_a_job_that_is_killed_more_often_than_it_may_crash_goes_on(yard: Shop, s
     setbacks = Setbacks.of(yard.job(job_id).setbacks)
     assert (len(setbacks.interruptions), len(setbacks.crashes)) == (yard.settings.starts + 1, 0)
     hold.unlink()
-    job = yard.ended(job_id)
+    job = yard.ended(job_id, 240)
     assert (job.state, job.error) == ("succeeded", None)
     assert job.setbacks == {}
 

@@ -19,11 +19,11 @@ import pytest
 import sqlalchemy as sa
 
 from specimap_core.pipeline.clock import STAGES
-from tests.cli.test_serve import running
 from tests.support.databases import postgres_url
 from tests.support.gate import Gate
 from tests.support.object_store import object_store
 from tests.support.scenes import Finished, OnDisk
+from tests.support.serve_scene import running
 from tests.support.service_scene import serving
 from tests.support.worker_scene import QUICK, Shop, processes_of, shop, until
 
