@@ -25,6 +25,8 @@ import signal
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from specimap_infra.errors import WorkerCrashedError
+
 MOST_ATTEMPTS = 100
 """Times that workers may take up one stage of a job, for whatever reason."""
 LONGEST_PAUSE_SECONDS = 30.0
@@ -84,6 +86,29 @@ class Setbacks:
         if len(self.interruptions) >= interruptions:
             return "interruptions"
         return "attempts" if self.attempts > MOST_ATTEMPTS else None
+
+    def failure(self, stage: str, reason: str, *, crashes: int, interruptions: int) -> WorkerCrashedError | None:
+        """Return the error that ends a job of which :meth:`cause` says so; ``reason``: how its last process ended."""
+        cause = self.cause(crashes=crashes, interruptions=interruptions)
+        if cause is None:
+            return None
+        counts = {
+            "crashes": len(self.crashes),
+            "interruptions": len(self.interruptions),
+            "attempts": self.attempts,
+        }
+        told = {
+            "crashes": f"The process of stage {stage} {reason}, {counts[cause]} times in a row.",
+            "interruptions": f"The process or the worker of stage {stage} {reason}, {counts[cause]} times in a row.",
+            "attempts": f"Stage {stage} did not get done in {counts[cause]} attempts.",
+        }
+        return WorkerCrashedError(
+            told[cause],
+            advice="Look at the job's log; fewer or smaller photos need less memory.",
+            stage=stage,
+            starts=counts[cause],
+            cause=cause,
+        )
 
 
 def pause_seconds(count: int) -> float:

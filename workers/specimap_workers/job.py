@@ -262,24 +262,8 @@ class JobRun:
             return jobs.set_back(session, self.job_id, self.executor, name, crash=not crash.from_outside)
 
     def _hopeless(self, stage: str, setbacks: Setbacks, reason: str = "died") -> WorkerCrashedError | None:
-        """The error that ends a job whose setbacks show that it is their cause; None where it goes on."""
         limits = {"crashes": self._settings.starts, "interruptions": self._settings.interruptions}
-        cause = setbacks.cause(**limits)
-        if cause is None:
-            return None
-        count = setbacks.attempts if cause == "attempts" else len(getattr(setbacks, cause))
-        told = {
-            "crashes": f"The process of stage {stage} {reason}, {count} times in a row",
-            "interruptions": f"The process or the worker of stage {stage} {reason}, {count} times in a row",
-            "attempts": f"Stage {stage} did not get done in {count} attempts",
-        }
-        return WorkerCrashedError(
-            f"{told[cause]}.",
-            advice="Look at the job's log; fewer or smaller photos need less memory.",
-            stage=stage,
-            starts=count,
-            cause=cause,
-        )
+        return setbacks.failure(stage, reason, **limits)
 
     def _earlier(self, plan: Plan) -> list[tuple[str, float, bool]]:
         """Stages before that are done, with their seconds and whether this job found them done."""
