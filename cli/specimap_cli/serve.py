@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import socket
-import sys
 from collections.abc import Callable
 from contextlib import suppress
 
@@ -20,6 +19,7 @@ from specimap_infra.projects import DEFAULT_PROJECT
 from specimap_infra.settings import ServiceSettings, load_settings
 from specimap_infra.storage import Storage
 from specimap_infra.tables import SCOPES, ApiKey
+from specimap_workers.reaper import burier
 from specimap_workers.supervisor import Supervisor
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
@@ -54,7 +54,7 @@ def serve(*, workers: bool, say: Callable[[str], None]) -> None:
     url = settings.public_url or f"http://{f'[{host}]' if ':' in host else host}:{port}"
     if settings.host not in LOOPBACK:
         say(f"Listening on {settings.host}: put a TLS proxy in front, since keys travel with every request.")
-    supervisor = Supervisor(settings.slots if workers else 0)
+    supervisor = Supervisor(settings.slots if workers else 0, bury=burier(settings))
 
     class Server(uvicorn.Server):
         async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -91,7 +91,7 @@ def work(*, slots: int | None, kind: str) -> None:
         Storage.open(settings).check_at_start()
     finally:
         database.close()
-    supervisor = Supervisor(slots or settings.slots, ("--kind", kind))
+    supervisor = Supervisor(slots or settings.slots, ("--kind", kind), burier(settings))
 
     def stop(number: int, _: object) -> None:
         raise KeyboardInterrupt
@@ -104,8 +104,6 @@ def work(*, slots: int | None, kind: str) -> None:
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         supervisor.stop()
-    if supervisor.refused.is_set():
-        sys.exit(2)
 
 
 def _listen(settings: ServiceSettings) -> socket.socket:

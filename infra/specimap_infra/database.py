@@ -13,10 +13,10 @@ from sqlalchemy.exc import DBAPIError, OperationalError
 from sqlalchemy.orm import Session, sessionmaker
 
 from specimap_core.atomic import disk_errors
+from specimap_infra.availability import Availability
 from specimap_infra.errors import DatabaseUnavailableError
+from specimap_infra.postgres import make_postgres_engine
 from specimap_infra.private_files import make_private
-
-CONNECT_SECONDS = 5
 
 
 def make_engine(url: str, *, pool_size: int = 10) -> sa.Engine:
@@ -38,15 +38,7 @@ def make_engine(url: str, *, pool_size: int = 10) -> sa.Engine:
                 connection.execute(f"PRAGMA {pragma}")  # type: ignore[attr-defined]
 
         return engine
-    return sa.create_engine(
-        parsed,
-        pool_size=pool_size,
-        max_overflow=20,
-        pool_timeout=CONNECT_SECONDS,
-        pool_pre_ping=True,
-        # A server that no longer answers is given up after ten seconds.
-        connect_args={"connect_timeout": CONNECT_SECONDS, "tcp_user_timeout": 10_000},
-    )
+    return make_postgres_engine(parsed, pool_size=pool_size)
 
 
 class Database:
@@ -54,6 +46,8 @@ class Database:
 
     def __init__(self, engine: sa.Engine) -> None:
         self.engine = engine
+        # A file is there or not at once; what takes time there is waiting for another writer.
+        self._availability = Availability("database", _refused, refuses=engine.dialect.name != "sqlite")
         self._sessions = sessionmaker(engine, expire_on_commit=False)
 
     @classmethod
@@ -68,7 +62,12 @@ class Database:
         Raises:
             DatabaseUnavailableError: the server cannot be reached.
         """
-        with database_errors(), self._sessions() as session, session.begin():
+        with (
+            self._availability.trying(_is_away),
+            database_errors(),
+            self._sessions() as session,
+            session.begin(),
+        ):
             yield session
 
     def check(self) -> None:
@@ -101,7 +100,20 @@ def _unavailable(error: Exception) -> DatabaseUnavailableError:
     )
 
 
-def database_seconds(engine: sa.Engine) -> sa.ColumnElement[float]:
+def _is_away(error: BaseException) -> bool:
+    """Whether an error tells that the server is away, not that it is busy or that two writers are at odds."""
+    cause = error.__cause__
+    if not isinstance(error, DatabaseUnavailableError) or not isinstance(cause, DBAPIError):
+        return False
+    state = getattr(cause.orig, "sqlstate", None)
+    return cause.connection_invalidated or state is None or state.startswith(("08", "57P"))
+
+
+def _refused() -> DatabaseUnavailableError:
+    return DatabaseUnavailableError("The database does not answer.", advice="Try again in some seconds.")
+
+
+def database_seconds(engine: sa.Engine | sa.Connection) -> sa.ColumnElement[float]:
     """Return the current time in seconds by the database's clock, which all machines share."""
     if engine.dialect.name == "sqlite":
         return sa.literal_column("((julianday('now') - 2440587.5) * 86400.0)", sa.Float())

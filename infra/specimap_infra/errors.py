@@ -18,7 +18,7 @@ class LostLeaseError(SpecimapError, RuntimeError):
 
 
 class WorkerCrashedError(SpecimapError, RuntimeError):
-    """The job's process died at every start; ``details['stage']`` names the stage."""
+    """The job's process or its workers died again and again; ``details`` name the ``stage`` and the ``cause``."""
 
     code = "worker_crashed"
 

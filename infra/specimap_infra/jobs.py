@@ -8,23 +8,25 @@ last, and a write by another, or after the end, changes nothing and raises LostL
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import sqlalchemy as sa
 from sqlalchemy.orm import Session
 
 from specimap_core.errors import NotFoundError, SpecimapError
 from specimap_core.json_text import json_ready
-from specimap_infra.database import utc_now
+from specimap_infra.database import database_seconds, utc_now
 from specimap_infra.errors import JobConflictError, LostLeaseError
 from specimap_infra.ids import new_id
-from specimap_infra.tables import FINAL_STATES, CloudRow, Delivery, Job, JobEvent
+from specimap_infra.setbacks import Setbacks
+from specimap_infra.tables import FINAL_STATES, CloudRow, Delivery, Export, Job, JobEvent
 
 State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 FinalState = Literal["succeeded", "failed", "cancelled"]
 Stage = Literal["reconstruct", "adjust", "render", "register"]
 EventType = Literal["state", "progress", "log"]
 Level = Literal["debug", "info", "warning", "error"]
+Worked = TypeVar("Worked", Job, Export)
 Failure = SpecimapError | dict[str, Any]
 """An error, or its ``as_dict`` from another process."""
 
@@ -51,6 +53,7 @@ def claim(session: Session, job_id: str, executor: str) -> Job | None:
     if job is None or job.state in FINAL_STATES:
         return None
     job.starts += 1
+    job.setbacks = Setbacks.of(job.setbacks).attempted().stored()
     job.started_at = job.started_at or utc_now()
     _change(session, job, "running", executor=executor)
     return job
@@ -96,17 +99,58 @@ def finish(
     _change(session, job, state, executor=executor, error=error)
 
 
-def release(session: Session, job_id: str) -> Job | None:
-    """Put a dead worker's job back into the queue for another to claim. Not fenced: only for the check of leases.
+def set_back(session: Session, job_id: str, executor: str, name: str, *, crash: bool) -> Setbacks:
+    """Note that the process of the running stage ended: ``crash`` by itself, else from outside.
+
+    ``name``: of this one end, which counts once however often it is told. Returns: the setbacks of the stage.
+
+    Raises:
+        LostLeaseError: the job is not this executor's.
+    """
+    job = held(session, job_id, executor)
+    before = Setbacks.of(job.setbacks)
+    after = before.crashed(name) if crash else before.interrupted(name, _now(session))
+    job.setbacks = after.stored()
+    return after
+
+
+def release(session: Session, job_id: str, executor: str, *, died: bool) -> Job | None:
+    """Put a job that an executor leaves back into the queue for another to claim. Not fenced: only for hand-overs.
+
+    ``died``: it ended in the middle of its work, which is a setback of the job; one that stops in order is none.
 
     Returns: the job; None if it was deleted or has ended.
     """
     job = locked(session, job_id)
     if job is None or job.state in FINAL_STATES:
         return None
-    if job.state == "running":
+    if job.state == "running" and job.executor == executor:
+        if died:
+            job.setbacks = Setbacks.of(job.setbacks).interrupted(executor, _now(session)).stored()
         _change(session, job, "queued")
     return job
+
+
+def take_back(session: Session, executor: str) -> None:
+    """Take back that an executor died: it was silent for longer than its lease, and lives."""
+    rows: list[Job | Export] = [*session.scalars(_set_back_by(Job, executor))]
+    rows += session.scalars(_set_back_by(Export, executor))
+    for row in rows:
+        row.setbacks = Setbacks.of(row.setbacks).without(executor).stored()
+
+
+def _set_back_by(table: type[Worked], executor: str) -> sa.Select[Worked]:
+    noted = sa.cast(table.setbacks, sa.String).contains(executor, autoescape=True)
+    return sa.select(table).where(table.state.not_in(FINAL_STATES), noted).with_for_update()
+
+
+def may_go_on(session: Session, setbacks: Setbacks) -> bool:
+    """Whether the pause after a setback is over."""
+    return setbacks.retry_at <= _now(session)
+
+
+def _now(session: Session) -> float:
+    return session.scalars(sa.select(database_seconds(session.get_bind()))).one()
 
 
 def fail_orphan(session: Session, job_id: str, error: Failure) -> Job | None:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import logging
+import re
 import sys
+import threading
+import time
 
 import structlog
 from structlog.tracebacks import ExceptionDictTransformer
@@ -11,6 +14,8 @@ from structlog.tracebacks import ExceptionDictTransformer
 from specimap_core.json_text import json_log_line
 from specimap_infra.settings import ServiceSettings
 
+LONGEST_LINE = 400
+MOST_KINDS = 1000
 SHARED: tuple[structlog.typing.Processor, ...] = (
     structlog.contextvars.merge_contextvars,
     structlog.processors.add_log_level,
@@ -46,6 +51,8 @@ def set_up_logs(settings: ServiceSettings) -> None:
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(level)
+    for name in ("dbos", "sqlalchemy.pool"):
+        logging.getLogger(name).filters[:] = [OneLine()]
     for name in ("uvicorn", "uvicorn.error", "uvicorn.access", "dbos", "alembic", "tuspyserver"):
         logger = logging.getLogger(name)
         logger.handlers[:] = []
@@ -53,6 +60,40 @@ def set_up_logs(settings: ServiceSettings) -> None:
     # The service writes its own access log; the libraries' routine lines are of no use.
     for name in ("uvicorn.access", "dbos", "alembic", "tuspyserver", "httpx", "httpcore"):
         logging.getLogger(name).setLevel(max(level, logging.WARNING))
+
+
+class OneLine(logging.Filter):
+    """Cut what a library logs of a failure to its first line, and let the same line pass only now and then.
+
+    While the database is away the job engine and the pool of connections log each of their tries, with statements and
+    tracebacks: some megabytes an hour that say one thing.
+    """
+
+    EVERY_SECONDS = 30.0
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._passed: dict[str, float] = {}
+        self._lock = threading.Lock()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether the record is logged; it is cut."""
+        if record.levelno < logging.WARNING:
+            return True
+        if record.exc_info and record.exc_info[1] is not None:
+            error = record.exc_info[1]
+            record.msg, record.args = f"{record.getMessage()} {type(error).__name__}: {error}", ()
+        record.exc_info = record.exc_text = record.stack_info = None
+        record.msg, record.args = record.getMessage().strip().split("\n", 1)[0][:LONGEST_LINE], ()
+        # Numbers differ from try to try: of the time to the next one, of the connection.
+        kind, now = re.sub(r"[0-9.]+", "", record.msg), time.monotonic()
+        with self._lock:
+            if now - self._passed.get(kind, -self.EVERY_SECONDS) < self.EVERY_SECONDS:
+                return False
+            if len(self._passed) > MOST_KINDS:
+                self._passed.clear()
+            self._passed[kind] = now
+        return True
 
 
 def logger() -> structlog.stdlib.BoundLogger:

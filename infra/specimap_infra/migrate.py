@@ -15,6 +15,7 @@ from alembic.config import Config
 from dbos import DBOS
 
 from specimap_infra.database import Database, database_errors
+from specimap_infra.postgres import unhurried
 from specimap_infra.tables import Base
 
 LOCK = 7261534
@@ -38,7 +39,7 @@ def migrate(database: Database) -> None:
     with database_errors(), exclusive_lock(database.engine):
         # The engine's own function, since its client never migrates.
         DBOS.migrate(database.engine.url.render_as_string(hide_password=False))
-        with database.engine.connect() as connection, whole(connection):
+        with database.engine.connect() as connection, unhurried(connection), whole(connection):
             command.upgrade(alembic_config(connection), "head")
 
 
@@ -83,7 +84,8 @@ def exclusive_lock(engine: sa.Engine) -> Iterator[None]:
         return
     # Outside a transaction: the engine builds indexes concurrently, which waits for open ones.
     with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
-        connection.execute(sa.text("SELECT pg_advisory_lock(:n)"), {"n": LOCK})
+        with unhurried(connection):
+            connection.execute(sa.text("SELECT pg_advisory_lock(:n)"), {"n": LOCK})
         try:
             yield
         finally:

@@ -130,13 +130,20 @@ class ServiceSettings(BaseSettings):
         default=0, ge=0, description="Most address space that a stage's process may take; 0 sets no limit."
     )
     starts: int = Field(
-        default=3, ge=1, description="Starts after which a job that keeps killing its process is failed."
+        default=3,
+        ge=1,
+        description="Starts of one stage after which a job is failed whose process keeps ending by itself.",
+    )
+    interruptions: int = Field(
+        default=15,
+        ge=1,
+        description="Times in one stage that a job's worker may die, or its process be killed from outside, before the job counts as the cause and is failed.",
     )
 
     patience_seconds: float = Field(
         default=300,
         gt=0,
-        description="How long a worker waits for an unreachable database or storage before it gives up a job.",
+        description="How long a worker waits for an unreachable storage before it gives up a job; for the database it waits without end.",
     )
 
     webhook_hosts: list[str] = Field(

@@ -21,9 +21,11 @@ from obstore.store import LocalStore, S3Store
 
 from specimap_core.atomic import disk_errors, remove
 from specimap_core.errors import SettingsError, StorageFullError
+from specimap_infra.availability import Availability
+from specimap_infra.errors import StorageUnavailableError
 from specimap_infra.logs import logger
 from specimap_infra.settings import ServiceSettings
-from specimap_infra.storage_errors import checked, not_found, store_errors
+from specimap_infra.storage_errors import checked, is_away, not_found, store_errors
 
 CHUNK = 1024 * 1024
 TEMPORARY = "tmp"
@@ -51,6 +53,7 @@ class Storage:
         self.folder = folder
         """The folder, where the storage is one."""
         self._scratch = scratch
+        self._availability = Availability("storage", _refused, refuses=folder is None)
 
     @classmethod
     def open(cls, settings: ServiceSettings) -> Self:
@@ -78,8 +81,15 @@ class Storage:
                 endpoint=settings.s3_endpoint or None,
                 region=settings.s3_region,
                 virtual_hosted_style_request=False,
-                client_options={"allow_http": settings.s3_endpoint.startswith("http://"), "timeout": "60s"},
-                retry_config={"max_retries": 4, "retry_timeout": datetime.timedelta(seconds=30)},
+                client_options={
+                    "allow_http": settings.s3_endpoint.startswith("http://"),
+                    "timeout": "60s",
+                    "connect_timeout": "5s",
+                    # Also the longest time that one request's bytes, and the answer to them, may take.
+                    "read_timeout": "12s",
+                },
+                # Short: whoever can wait longer tries again as a whole.
+                retry_config={"max_retries": 3, "retry_timeout": datetime.timedelta(seconds=5)},
             )
         except (ValueError, obstore.exceptions.BaseError) as error:
             raise SettingsError(
@@ -95,15 +105,16 @@ class Storage:
 
     def stat(self, key: str) -> Stored:
         """Return size and ETag. Raises NotFoundError."""
-        with store_errors(key):
+        with self._trying(key):
             return _stored(obstore.head(self._store, checked(key)))
 
     def read(self, key: str, start: int = 0, stop: int | None = None) -> bytes:
         """Read the file's bytes from ``start`` up to ``stop``. Raises NotFoundError."""
-        with store_errors(key):
-            if start == 0 and stop is None:
+        whole = start == 0 and stop is None
+        end = self.stat(key).size if stop is None and not whole else stop or 0
+        with self._trying(key):
+            if whole:
                 return bytes(obstore.get(self._store, checked(key)).bytes())
-            end = self.stat(key).size if stop is None else stop
             return bytes(obstore.get_range(self._store, checked(key), start=start, end=end)) if end > start else b""
 
     def stream(self, key: str, start: int = 0, stop: int | None = None) -> Iterator[bytes]:
@@ -125,7 +136,7 @@ class Storage:
 
     def list(self, prefix: str) -> Iterator[Stored]:
         """List all files below a prefix."""
-        with store_errors(prefix):
+        with self._trying(prefix):
             for batch in obstore.list(self._store, checked(prefix) + "/"):
                 yield from map(_stored, batch)
 
@@ -138,7 +149,7 @@ class Storage:
                 if not local.exists():
                     raise not_found(key)
                 # A link is instant, and keeps the data for a running stage if the file is deleted meanwhile.
-                shutil.copytree(local, target, copy_function=_link) if local.is_dir() else _link(local, target)
+                link(local, target)
                 return
             found = list(self.list(key))
             for item in found:
@@ -161,15 +172,15 @@ class Storage:
 
     def put(self, key: str, data: bytes) -> None:
         """Write a file whole or not at all."""
-        with store_errors(key):
+        with self._trying(key):
             obstore.put(self._store, checked(key), data)
 
     def put_file(self, key: str, source: Path) -> None:
         """Move a local file into the storage, whole or not at all; ``source`` is gone afterwards."""
         local = self.path(key)
-        with store_errors(key):
+        with self._trying(key):
             if local is None:
-                obstore.put(self._store, checked(key), source, chunk_size=16 * CHUNK)
+                obstore.put(self._store, checked(key), source, chunk_size=8 * CHUNK)
                 source.unlink()
                 return
             with disk_errors(local):
@@ -193,7 +204,7 @@ class Storage:
         """Make a local folder to fill; its files are stored below ``prefix`` when the block succeeds.
 
         In a folder they appear together, by one rename. In a bucket they appear one by one: nothing may refer to
-        the prefix before the block has ended.
+        the prefix before the block has ended. Where it fails it may be done again, under the same prefix.
         """
         local = self.path(prefix)
         aside = self._aside(prefix.rsplit("/", 1)[-1]) if local else self._scratch / f"{uuid.uuid4().hex}.tmp"
@@ -201,21 +212,24 @@ class Storage:
             aside.mkdir(parents=True)
         try:
             yield aside
-            with store_errors(prefix):
-                if local is not None:
-                    local.parent.mkdir(parents=True, exist_ok=True)
-                    os.rename(aside, local)
-                    _flush(local.parent)
-                    return
+            if local is None:
                 for file in sorted(p for p in aside.rglob("*") if p.is_file()):
                     self.put_file(f"{prefix}/{file.relative_to(aside).as_posix()}", file)
+                return
+            with self._trying(prefix):
+                local.parent.mkdir(parents=True, exist_ok=True)
+                # Of a try whose end was not heard of.
+                remove(local)
+                os.rename(aside, local)
+                _flush(local.parent)
         finally:
             remove(aside)
 
     def delete(self, key: str) -> None:
         """Remove a file, or all files below a prefix; not an error where there is none."""
         local = self.path(key)
-        with store_errors(key):
+        keys = [item.key for item in self.list(key)] if local is None else []
+        with self._trying(key):
             if local is not None:
                 if local.is_dir():
                     # Hidden at once by a rename, then removed file by file.
@@ -225,7 +239,6 @@ class Storage:
                 else:
                     local.unlink(missing_ok=True)
                 return
-            keys = [item.key for item in self.list(key)]
             for at in range(0, len(keys), 1000):
                 obstore.delete(self._store, keys[at : at + 1000])
             obstore.delete(self._store, checked(key))
@@ -233,6 +246,12 @@ class Storage:
     def _aside(self, name: str) -> Path:
         assert self.folder is not None
         return self.folder / TEMPORARY / f"{name}.{uuid.uuid4().hex[:8]}.tmp"
+
+    @contextmanager
+    def _trying(self, key: str) -> Iterator[None]:
+        """One try at the store, which never holds another one."""
+        with self._availability.trying(is_away), store_errors(key):
+            yield
 
     # ---- state ----------------------------------------------------------------------------------------
 
@@ -260,6 +279,18 @@ class Storage:
 def _stored(meta: obstore.ObjectMeta) -> Stored:
     etag = (meta["e_tag"] or f"{meta['size']:x}-{meta['last_modified'].timestamp():x}").strip('"')
     return Stored(meta["path"], meta["size"], etag, meta["last_modified"])
+
+
+def link(source: Path, target: Path) -> None:
+    """Link a file, or the files of a folder; copy them where links are impossible."""
+    if source.is_dir():
+        shutil.copytree(source, target, copy_function=_link)
+    else:
+        _link(source, target)
+
+
+def _refused() -> StorageUnavailableError:
+    return StorageUnavailableError("The storage does not answer.", advice="Try again later.")
 
 
 def _link(source: str | Path, target: str | Path) -> object:

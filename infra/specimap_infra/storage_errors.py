@@ -49,6 +49,13 @@ def store_errors(key: str) -> Iterator[None]:
         raise _unavailable(error) from error
 
 
+def is_away(error: BaseException) -> bool:
+    """Whether an error tells that the store is away, not that it answers by a refusal."""
+    return isinstance(error, StorageUnavailableError) and isinstance(
+        error.__cause__, obstore.exceptions.GenericError | OSError | OutputNotWritableError
+    )
+
+
 def _unavailable(error: Exception) -> StorageUnavailableError:
     # The store's own message may name buckets and accounts: it goes to the log with the traceback.
     return StorageUnavailableError(

@@ -160,6 +160,9 @@ class Job(Base):
     error: Mapped[dict[str, Any] | None]
     """Code, message, advice and details of the failure."""
     starts: Mapped[int] = mapped_column(default=0)
+    """How often a worker took it up."""
+    setbacks: Mapped[dict[str, Any]] = mapped_column(default=dict, server_default=sa.text("'{}'"))
+    """Of :mod:`specimap_infra.setbacks`, since the last finished stage."""
     executor: Mapped[str | None]
     """The worker that may write to this row: one that lost its lease finds another's name here."""
     idempotency_key: Mapped[str | None]
@@ -257,6 +260,8 @@ class Export(Base):
     executor: Mapped[str | None]
     labels_hash: Mapped[str] = mapped_column(default="")
     """Hash of the label layers in it, if it holds any: shows whether it is still current."""
+    setbacks: Mapped[dict[str, Any]] = mapped_column(default=dict, server_default=sa.text("'{}'"))
+    """Of :mod:`specimap_infra.setbacks`."""
     correlation_id: Mapped[str]
     created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now)
     created_by: Mapped[str]

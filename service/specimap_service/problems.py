@@ -10,15 +10,21 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 from pydantic.json_schema import models_json_schema
+from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
+from starlette.responses import Response
 
 from specimap_core.errors import SpecimapError
+from specimap_infra.database import database_errors
+from specimap_infra.errors import DatabaseUnavailableError, StorageUnavailableError
 from specimap_infra.logs import logger
 from specimap_service.context import correlation_id
 from specimap_service.errors import RateLimitedError, RequestInvalidError, UnauthorizedError
 from specimap_service.http_status import error_class, status_of
 
+AWAY = (DatabaseUnavailableError, StorageUnavailableError)
+RETRY_AFTER_SECONDS = "5"
 MEDIA_TYPE = "application/problem+json"
 CLIENT_CLOSED = 499
 ADVICE = {409: "Ask for the offset with HEAD, and continue from there."}
@@ -65,6 +71,8 @@ def problem_response(error: SpecimapError, status: int | None = None, **headers:
     status = status or status_of(error)
     if isinstance(error, RateLimitedError) or "retry_after_s" in error.details:
         headers["Retry-After"] = str(error.details.get("retry_after_s", 1))
+    elif isinstance(error, AWAY):
+        headers["Retry-After"] = RETRY_AFTER_SECONDS
     if isinstance(error, UnauthorizedError):
         headers["WWW-Authenticate"] = "Bearer"
     body = Problem(
@@ -85,9 +93,21 @@ def add_handlers(app: FastAPI) -> None:
 
     @app.exception_handler(SpecimapError)
     async def _known(request: Request, error: SpecimapError) -> JSONResponse:
-        if status_of(error) >= 500:
+        if isinstance(error, AWAY):
+            # The log tells once that they are away, and why; a traceback of each request would bury that.
+            logger().warning("request refused", code=error.code)
+        elif status_of(error) >= 500:
             logger().error("request failed", code=error.code, exc_info=error)
         return problem_response(error)
+
+    @app.exception_handler(SQLAlchemyError)
+    async def _database(request: Request, error: SQLAlchemyError) -> Response:
+        """Answer errors of the job engine's own transactions as those of ours."""
+        try:
+            with database_errors():
+                raise error
+        except DatabaseUnavailableError as away:
+            return await _known(request, away)
 
     @app.exception_handler(RequestValidationError)
     async def _invalid(request: Request, error: RequestValidationError) -> JSONResponse:

@@ -2,14 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import subprocess
-import sys
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import httpx
@@ -21,61 +14,10 @@ from specimap_core.cloud import Cloud
 from specimap_core.report.model import Report
 from tests.support.places import ROOT
 from tests.support.scenes import OnDisk
+from tests.support.serve_scene import running
 from tests.support.worker_scene import processes_of, until
 
 pytestmark = pytest.mark.slow
-
-PROGRAM = (sys.executable, "-c", "from specimap_cli import main; main()")
-
-
-@dataclass
-class Served:
-    """A program that serves, and what it has printed."""
-
-    process: subprocess.Popen[str]
-    lines: list[str] = field(default_factory=list)
-
-    def printed(self, start: str, seconds: float = 40) -> str:
-        """The rest of the line that starts so, once it is there."""
-
-        def found() -> str:
-            assert self.process.poll() is None, self.lines
-            return next((line.removeprefix(start).strip() for line in self.lines if line.startswith(start)), "")
-
-        return str(until(found, seconds, start))
-
-
-@contextmanager
-def running(folder: Path, *arguments: str, **settings: str) -> Iterator[Served]:
-    environment = {
-        **os.environ,
-        "SPECIMAP_DATA_DIR": str(folder),
-        "SPECIMAP_PORT": "0",
-        "SPECIMAP_LOG_LEVEL": "warning",
-        "SPECIMAP_LEASE_SECONDS": "4",
-        "SPECIMAP_HEARTBEAT_SECONDS": "1",
-        "SPECIMAP_MIN_FREE_BYTES": "0",
-        "PYTHONUNBUFFERED": "1",
-        **settings,
-    }
-    process = subprocess.Popen(
-        [*PROGRAM, *(arguments or ("serve",))],
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-    served = Served(process)
-    assert process.stdout is not None
-    reader = threading.Thread(target=lambda out=process.stdout: served.lines.extend(iter(out.readline, "")))
-    reader.start()
-    try:
-        yield served
-    finally:
-        process.kill()
-        process.wait(10)
-        reader.join(10)
-        process.stdout.close()
 
 
 def test_first_start_tells_address_and_key_and_the_second_only_the_address(tmp_path: Path) -> None:

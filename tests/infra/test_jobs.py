@@ -80,7 +80,7 @@ def test_final_states_never_change(tables: Database, final: jobs.FinalState) -> 
         assert caught.value.details == {"state": final, "wanted": state}
     with tables.session() as session:
         assert jobs.claim(session, job_id, "host:0:two") is None
-        assert jobs.release(session, job_id) is None
+        assert jobs.release(session, job_id, EXECUTOR, died=True) is None
         assert jobs.fail_orphan(session, job_id, {"code": "x"}) is None
     assert row(tables, job_id).state == final
     assert [e.seq for e in events(tables, job_id)] == before
@@ -114,7 +114,7 @@ def test_worker_that_lost_the_job_changes_nothing(
         if how == "cancelled":
             jobs.request_cancel(session, job_id)
         else:
-            jobs.release(session, job_id)
+            jobs.release(session, job_id, EXECUTOR, died=True)
         if how == "taken over":
             jobs.claim(session, job_id, "host:1:two")
     before, described = row(tables, job_id), [e.seq for e in events(tables, job_id)]
@@ -134,7 +134,7 @@ def test_released_job_is_claimed_again_and_keeps_its_start(tables: Database) -> 
     first = row(tables, job_id).started_at
     with tables.session() as session:
         jobs.report_progress(session, job_id, EXECUTOR, "register", 0.9)
-        jobs.release(session, job_id)
+        jobs.release(session, job_id, EXECUTOR, died=True)
     waiting = row(tables, job_id)
     assert (waiting.state, waiting.executor, waiting.stage, waiting.progress) == ("queued", None, "register", 0.0)
     with tables.session() as session:
@@ -156,7 +156,7 @@ def test_jobs_that_are_gone(tables: Database) -> None:
     gone = "job_" + "0" * 26
     with tables.session() as session:
         assert jobs.claim(session, gone, EXECUTOR) is None
-        assert jobs.release(session, gone) is None
+        assert jobs.release(session, gone, EXECUTOR, died=True) is None
         with pytest.raises(LostLeaseError):
             jobs.log(session, gone, EXECUTOR, "info", "Anyone?")
         for call in (jobs.request_cancel, lambda s, j: jobs.append_event(s, j, "log", {})):

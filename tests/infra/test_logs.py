@@ -50,3 +50,24 @@ def test_tracebacks_hold_no_values(
         entry = json.loads(text)
         assert (entry["event"], entry["level"], entry["job"]) == ("unforeseen", "error", "job_1")
         assert entry["exception"][0]["exc_type"] == "ValueError"
+
+
+def test_what_a_library_says_again_and_again_is_one_short_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    set_up_logs(load_settings(data_dir=tmp_path, log_format="json"))
+    engine, pool = logging.getLogger("dbos"), logging.getLogger("sqlalchemy.pool")
+    for attempt in range(50):
+        engine.warning(f"Database connection failed: refused\n[SQL: SELECT {'x' * 1000}]. Retrying ({attempt})")
+        try:
+            raise ConnectionError("connection 17 is gone\nfor good")
+        except ConnectionError:
+            pool.exception("Exception during reset")
+    engine.warning("Another thing")
+    lines = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    assert [line["event"] for line in lines] == [
+        "Database connection failed: refused",
+        "Exception during reset ConnectionError: connection 17 is gone",
+        "Another thing",
+    ]
+    assert not any("exception" in line for line in lines)

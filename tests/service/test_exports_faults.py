@@ -18,8 +18,11 @@ import pytest
 import sqlalchemy as sa
 
 from specimap_core.errors import CancelledError
+from specimap_infra.errors import StorageUnavailableError
+from specimap_infra.storage import Storage
 from specimap_infra.tables import CloudRow, Export
-from specimap_workers import exports
+from specimap_workers import export_rows, exports
+from specimap_workers.export_rows import claim, release_export
 from specimap_workers.exports import run_export
 from tests.support.export_scene import address, make
 from tests.support.result_scene import Result, put_result
@@ -83,23 +86,64 @@ def nothing_left(service: Running) -> bool:
     return not list(service.settings.scratch.glob("exp_*")) and not list(stored.rglob("*"))
 
 
-def test_a_process_that_is_killed_is_started_again_and_then_failed(
-    service: Running, client: httpx.Client, result: Result, slow: Callable[[], int]
+@pytest.mark.parametrize("by", [signal.SIGSEGV, signal.SIGKILL])
+@pytest.mark.usefixtures("no_memory_kills")
+def test_a_process_that_dies_is_started_again_and_then_failed(
+    service: Running, client: httpx.Client, result: Result, slow: Callable[[], int], by: signal.Signals
 ) -> None:
     export_id = client.post(address(result, "ply")).json()["id"]
-    working = threading.Thread(target=make, args=(service, export_id))
+    # One more kill from outside than it may crash; each in its own right.
+    limits = service.settings.model_copy(update={"starts": 2, "interruptions": 3})
+    working = threading.Thread(
+        target=run_export, args=(export_id, service.database, service.storage, limits, "worker-1")
+    )
     working.start()
-    for _ in range(service.settings.starts):
+    for _ in range(limits.interruptions if by == signal.SIGKILL else limits.starts):
         pid = slow()
         assert client.get(address(result, "ply")).json()["state"] == "running"
         assert client.get(address(result, "ply") + "/content").status_code == 409
-        os.kill(pid, signal.SIGKILL)
+        os.kill(pid, by)
     working.join(20)
     export = client.get(address(result, "ply")).json()
     assert (export["state"], export["error"]["code"]) == ("failed", "worker_crashed")
-    assert export["error"]["details"] == {"stage": "export", "status": -9}
+    assert export["error"]["details"] == {"stage": "export", "status": -by}
     assert client.get(address(result, "ply") + "/content").status_code == 409
     assert nothing_left(service)
+
+
+def test_an_export_that_takes_its_workers_along_is_failed(
+    service: Running, client: httpx.Client, result: Result
+) -> None:
+    export_id = client.post(address(result, "ply")).json()["id"]
+    limits = service.settings.model_copy(update={"interruptions": 2})
+    for number in range(limits.interruptions):
+        executor = f"worker-{number}"
+        assert claim(service.database, export_id, executor) is not None
+        for _ in range(2):  # told twice, it counts once
+            with service.database.session() as session:
+                release_export(session, export_id, executor, died=True)
+    run_export(export_id, service.database, service.storage, limits, "worker-9")
+    export = client.get(address(result, "ply")).json()
+    assert (export["state"], export["error"]["code"]) == ("failed", "worker_crashed")
+
+
+def test_an_export_waits_for_the_storage(
+    service: Running, client: httpx.Client, result: Result, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    export_id = client.post(address(result, "ply")).json()["id"]
+    tries: list[int] = []
+    fetch = Storage.fetch
+
+    def fetching(storage: Storage, key: str, target: Path) -> None:
+        tries.append(1)
+        if len(tries) < 3:
+            raise StorageUnavailableError("Away.", advice="Wait.")
+        fetch(storage, key, target)
+
+    monkeypatch.setattr(Storage, "fetch", fetching)
+    make(service, export_id)
+    assert len(tries) == 3
+    assert client.get(address(result, "ply")).json()["state"] == "succeeded"
 
 
 @pytest.mark.slow
@@ -151,14 +195,14 @@ def test_a_worker_that_comes_too_late_takes_its_file_back(
     service: Running, client: httpx.Client, result: Result, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     export_id = client.post(address(result, "ply")).json()["id"]
-    finish = exports._finish
+    finish = export_rows.finish
 
     def late(*arguments: Any) -> bool:
         monkeypatch.undo()
         make(service, export_id, "worker-2")
         return finish(*arguments)
 
-    monkeypatch.setattr(exports, "_finish", late)
+    monkeypatch.setattr(exports, "finish", late)
     make(service, export_id, "worker-1")
     stored = service.settings.data_dir / "storage" / "exports"
     (kept,) = (path for path in stored.rglob("*") if path.is_file())

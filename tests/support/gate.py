@@ -1,4 +1,4 @@
-"""A TCP gate before a server: shut, it drops what is open and refuses what comes."""
+"""A TCP gate before a server: shut, it drops what is open and refuses what comes; hung, it lets nothing through."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ class Gate:
         self._target = target
         self._open = threading.Event()
         self._open.set()
+        self._flowing = threading.Event()
+        self._flowing.set()
         self._sockets: set[socket.socket] = set()
         self._lock = threading.Lock()
         self._listener = socket.create_server(("127.0.0.1", 0))
@@ -39,10 +41,16 @@ class Gate:
             with suppress(OSError):
                 connection.shutdown(socket.SHUT_RDWR)
             connection.close()
+        self._flowing.set()
+
+    def hang(self) -> None:
+        """Keep all connections, and take new ones, but let no byte through."""
+        self._flowing.clear()
 
     def open(self) -> None:
-        """Let new connections through."""
+        """Let connections, and what was held back, through."""
         self._open.set()
+        self._flowing.set()
 
     def _accept(self) -> None:
         while True:
@@ -53,20 +61,24 @@ class Gate:
             if not self._open.is_set():
                 near.close()
                 continue
-            try:
-                far = socket.create_connection(self._target, timeout=5)
-            except OSError:
-                near.close()
-                continue
-            far.settimeout(None)
-            with self._lock:
-                self._sockets |= {near, far}
-            for one, other in ((near, far), (far, near)):
-                threading.Thread(target=self._pass_on, args=(one, other), daemon=True).start()
+            threading.Thread(target=self._connect, args=(near,), daemon=True).start()
+
+    def _connect(self, near: socket.socket) -> None:
+        try:
+            far = socket.create_connection(self._target, timeout=5)
+        except OSError:
+            near.close()
+            return
+        far.settimeout(None)
+        with self._lock:
+            self._sockets |= {near, far}
+        for one, other in ((near, far), (far, near)):
+            threading.Thread(target=self._pass_on, args=(one, other), daemon=True).start()
 
     def _pass_on(self, one: socket.socket, other: socket.socket) -> None:
         with suppress(OSError):
             while piece := one.recv(65536):
+                self._flowing.wait()
                 other.sendall(piece)
         for connection in (one, other):
             with suppress(OSError):

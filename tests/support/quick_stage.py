@@ -23,8 +23,13 @@ if spec:
     time.sleep(float(os.environ.get("STAGE_SECONDS", "0")))
     if stage == "register":
         for path in Path(os.environ["RESULT_FOLDER"]).iterdir():
-            if path.name != "stages" and not path.name.startswith("."):
-                (shutil.copytree if path.is_dir() else shutil.copyfile)(path, out / path.name)
+            if path.name == "stages" or path.name.startswith("."):
+                continue
+            if path.is_dir():
+                # One that was killed may have left a part of it.
+                shutil.copytree(path, out / path.name, dirs_exist_ok=True)
+            else:
+                shutil.copyfile(path, out / path.name)
     else:
         (out / "stages").mkdir(exist_ok=True)
         (out / "stages" / f"{stage}-{spec['keys'][stage]}.npz").write_bytes(b"an artefact")

@@ -6,7 +6,8 @@ import fcntl
 import hashlib
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,6 +35,27 @@ class SharedFolders:
                 make(unfinished)
                 unfinished.rename(folder)
         return folder
+
+
+@contextmanager
+def _memory_kills(shared_folders: SharedFolders, kind: int) -> Iterator[None]:
+    with open(shared_folders.root / "memory-kills.lock", "w", encoding="ascii") as lock:
+        fcntl.flock(lock, kind)
+        yield
+
+
+@pytest.fixture
+def memory_kills(shared_folders: SharedFolders) -> Iterator[None]:
+    """For a test that has the kernel kill processes for want of memory, which it counts for the whole machine."""
+    with _memory_kills(shared_folders, fcntl.LOCK_EX):
+        yield
+
+
+@pytest.fixture
+def no_memory_kills(shared_folders: SharedFolders) -> Iterator[None]:
+    """For a test that tells other kills from those: none of them happens meanwhile."""
+    with _memory_kills(shared_folders, fcntl.LOCK_SH):
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -15,6 +15,8 @@ import pytest
 
 from specimap_core.cloud import Cloud
 from specimap_core.pipeline.clock import STAGES
+from specimap_infra.setbacks import Setbacks
+from specimap_workers.executors import suffix_of
 from specimap_workers.stage_process import SPARES
 from tests.support.scenes import Finished, OnDisk
 from tests.support.worker_scene import Shop, processes_of, shop, until
@@ -124,11 +126,69 @@ def test_a_frozen_worker_that_wakes_up_changes_nothing(yard: Shop, small: OnDisk
     assert_same_cloud(yard, job_id, finished)
 
 
+@pytest.mark.usefixtures("no_memory_kills")
+def test_a_job_that_is_killed_more_often_than_it_may_crash_goes_on(yard: Shop, small: OnDisk) -> None:
+    acquisition = yard.acquisition(small.photos, small.header)
+    hold = yard.holding("reconstruct")
+    worker = yard.start()
+    job_id = yard.submit(acquisition)
+    for number in range(yard.settings.starts + 1):
+        pid = yard.held("reconstruct")
+        if number % 2:
+            os.kill(pid, signal.SIGKILL)
+        else:
+            worker.kill()
+            worker = yard.start()
+        until(partial(gone, pid), 5, "the end of the stage's process")
+    yard.held("reconstruct")
+    setbacks = Setbacks.of(yard.job(job_id).setbacks)
+    assert (len(setbacks.interruptions), len(setbacks.crashes)) == (yard.settings.starts + 1, 0)
+    hold.unlink()
+    job = yard.ended(job_id, 240)
+    assert (job.state, job.error) == ("succeeded", None)
+    assert job.setbacks == {}
+
+
+def test_a_dead_worker_of_this_machine_is_found_before_its_lease_has_run_out(tmp_path: Path, small: OnDisk) -> None:
+    with shop(tmp_path / "shop", lease_seconds=600) as yard:
+        yard.holding("reconstruct")
+        first = yard.start()
+        job_id = yard.submit(yard.acquisition(small.photos, small.header))
+        pid, executor = yard.held("reconstruct"), yard.job(job_id).executor
+        yard.start()
+        first.kill()
+        until(partial(gone, pid), 5, "the end of the stage's process")
+        until(partial(taken_from, yard, job_id, executor), TAKEOVER_SECONDS, "the takeover")
+        yard.held("reconstruct")
+        assert executor not in yard.leases()
+        assert executor is not None
+        until(lambda: not list((yard.settings.scratch / "work").glob(f"*{suffix_of(executor)}*")), 30, "a sweep")
+
+
+def test_a_frozen_worker_takes_its_interruption_back(yard: Shop, small: OnDisk) -> None:
+    yard.holding("reconstruct")
+    frozen = yard.start()
+    job_id = yard.submit(yard.acquisition(small.photos, small.header))
+    yard.held("reconstruct")
+    yard.freeze(frozen)
+    yard.start()
+    executor = yard.job(job_id).executor
+    until(partial(taken_from, yard, job_id, executor), TAKEOVER_SECONDS, "the takeover")
+    assert yard.job(job_id).setbacks["interruptions"] == [executor]
+    frozen.send_signal(signal.SIGCONT)
+    until(lambda: yard.job(job_id).setbacks["interruptions"] == [], 20, "the heartbeat")
+
+
 @pytest.mark.parametrize("victim", ["KILL_WORKER", "KILL_SELF"])
-def test_a_poisoned_job_fails_with_its_reason_and_the_queue_goes_on(yard: Shop, small: OnDisk, victim: str) -> None:
+def test_a_poisoned_job_fails_with_its_reason_and_the_queue_goes_on(tmp_path: Path, small: OnDisk, victim: str) -> None:
+    with shop(tmp_path / "shop", interruptions=3, starts=3) as yard:
+        assert_poisoned_job_fails(yard, small, victim)
+
+
+def assert_poisoned_job_fails(yard: Shop, small: OnDisk, victim: str) -> None:
     acquisition = yard.acquisition(small.photos, small.header)
     poisoned = yard.submit(acquisition)
-    for _ in range(yard.settings.starts if victim == "KILL_WORKER" else 1):
+    for _ in range(yard.settings.interruptions if victim == "KILL_WORKER" else 1):
         worker = yard.start(**{victim: "reconstruct"})
         if victim == "KILL_WORKER":
             worker.wait(30)
@@ -139,7 +199,8 @@ def test_a_poisoned_job_fails_with_its_reason_and_the_queue_goes_on(yard: Shop, 
     assert job.state == "failed"
     assert job.error is not None
     assert (job.error["code"], job.error["details"]["stage"]) == ("worker_crashed", "reconstruct")
-    assert job.error["details"]["starts"] == yard.settings.starts
+    assert job.error["details"]["starts"] == 3
+    assert job.error["details"]["cause"] == ("interruptions" if victim == "KILL_WORKER" else "crashes")
     if victim == "KILL_SELF":
         assert "SIGSEGV" in job.error["message"]
         yard.stop()

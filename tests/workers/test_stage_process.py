@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import sys
 import threading
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -19,6 +21,7 @@ from specimap_workers.workspaces import Workspaces
 SPEC = {"stage": "reconstruct"}
 READ = "import json, os, signal, sys, time\nspec = json.loads(sys.stdin.readline())\n"
 SOON_SECONDS = 10.0
+CGROUPS = Path("/sys/fs/cgroup")
 
 
 def run(tmp_path: Path, program: str, use: Callable[[StageProcess], Awaitable[None]]) -> None:
@@ -78,17 +81,56 @@ def test_a_refusal(tmp_path: Path) -> None:
         ("print('why', file=sys.stderr); os.kill(os.getpid(), signal.SIGSEGV)", "was ended by SIGSEGV"),
         (
             "print('why', file=sys.stderr); os.kill(os.getpid(), signal.SIGKILL)",
-            "was ended by SIGKILL (often: out of memory)",
+            "was ended by SIGKILL",
         ),
     ],
 )
+@pytest.mark.usefixtures("no_memory_kills")
 def test_a_crash_has_its_reason_and_its_last_lines(tmp_path: Path, program: str, reason: str) -> None:
     async def use(process: StageProcess) -> None:
         with pytest.raises(StageCrashedError) as caught:
             await process.run(SPEC, ignore, 60)
         assert (caught.value.reason, caught.value.tail) == (reason, ["why"])
+        assert caught.value.from_outside == ("SIGKILL" in reason)
 
     run(tmp_path, program, use)
+
+
+@pytest.fixture
+def little_memory(memory_kills: None) -> Iterator[Path]:
+    """A control group whose processes may take 64 MB; skips where none can be made."""
+    for parent, limit in ((CGROUPS / "memory", "memory.limit_in_bytes"), (CGROUPS, "memory.max")):
+        group = parent / f"specimap-test-{os.getpid()}"
+        try:
+            group.mkdir()
+            (group / limit).write_text("67108864")
+        except OSError:
+            with suppress(OSError):
+                group.rmdir()
+            continue
+        yield group / "cgroup.procs"
+        group.rmdir()
+        return
+    pytest.skip("no control group can be made here: that takes root's rights")
+
+
+def test_a_process_killed_for_want_of_memory_has_crashed(tmp_path: Path, little_memory: Path) -> None:
+    async def use(process: StageProcess) -> None:
+        with pytest.raises(StageCrashedError) as caught:
+            await process.run(SPEC, ignore, 60)
+        assert caught.value.reason == "was ended by SIGKILL (out of memory)"
+        assert not caught.value.from_outside
+
+    group = repr(str(little_memory))
+    run(tmp_path, f"open({group}, 'w').write(str(os.getpid())); data = b'1' * 200_000_000; time.sleep(60)", use)
+
+
+def test_the_kernel_takes_a_stage_before_its_worker(tmp_path: Path) -> None:
+    async def use(process: StageProcess) -> None:
+        assert await process.run(SPEC, ignore, 60) == 1000
+
+    score = "int(open('/proc/self/oom_score_adj').read())"
+    run(tmp_path, f"print(json.dumps({{'event': 'done', 'seconds': {score}}}), flush=True); time.sleep(60)", use)
 
 
 def test_a_line_that_is_no_message_ends_the_stage(tmp_path: Path) -> None:

@@ -89,8 +89,8 @@ class Artefacts:
                         seconds=seconds,
                     )
                 )
-                # Starts count from the last finished stage: a job that gets on is not poisoned.
-                job.starts = 1
+                # They count from the last finished stage: a job that gets on is sound.
+                job.setbacks = {}
                 job.seconds = {**job.seconds, stage: round(seconds, 3)}
         except BaseException:
             self.storage.delete(storage_key)

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import os
-import shutil
 import time
+import uuid
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
-
-import tenacity
 
 from specimap_core.atomic import disk_errors, remove
 from specimap_core.errors import SpecimapError
@@ -20,13 +18,16 @@ from specimap_core.reconstruct.backends.environment import BackendSettings
 from specimap_core.report.model import Report
 from specimap_infra import jobs
 from specimap_infra.database import Database
-from specimap_infra.errors import DatabaseUnavailableError, LostLeaseError, StorageUnavailableError, WorkerCrashedError
+from specimap_infra.errors import DatabaseUnavailableError, LostLeaseError, WorkerCrashedError
 from specimap_infra.ids import new_id
 from specimap_infra.logs import logger
+from specimap_infra.setbacks import Setbacks, pause_seconds
 from specimap_infra.settings import ServiceSettings
-from specimap_infra.storage import Storage
+from specimap_infra.storage import Storage, link
 from specimap_infra.tables import CloudRow, Job
 from specimap_workers.artefacts import SAVED, Artefacts
+from specimap_workers.executors import suffix_of
+from specimap_workers.patience import patience
 from specimap_workers.plan import Plan, plan_of
 from specimap_workers.stage_process import Processes, RefusedError, StageCrashedError, StageProcess
 from specimap_workers.workspaces import is_plain
@@ -34,6 +35,8 @@ from specimap_workers.workspaces import is_plain
 Value = TypeVar("Value")
 PROGRESS_SECONDS = 0.4
 """Least time between two progress events of a stage: a person sees no more, and each is a transaction."""
+HELD_SECONDS = 3.0
+"""Longest pause between two processes of a stage: the slot waits meanwhile, and others may be in the queue."""
 RESULTS = ("cloud.zarr", "mesh.ply", "corners.json", "preview.png", "report.json")
 SHEET = "photos.jpg"
 """Not there where stage 1 was kept from a version that made none."""
@@ -63,12 +66,7 @@ class JobRun:
         self.folder = work_folder(settings.scratch, job_id, executor)
         self._inputs, self._out = self.folder / "inputs", self.folder / "out"
         self._plan: Plan | None = None
-        self._patiently = tenacity.Retrying(
-            retry=tenacity.retry_if_exception_type((DatabaseUnavailableError, StorageUnavailableError)),
-            wait=tenacity.wait_exponential_jitter(initial=0.2, max=5),
-            stop=tenacity.stop_after_delay(settings.patience_seconds),
-            reraise=True,
-        )
+        self._patiently = patience(settings.patience_seconds)
 
     # ---- called by the workflow -----------------------------------------------------------------------
 
@@ -80,13 +78,10 @@ class JobRun:
                 job = jobs.claim(session, self.job_id, self.executor)
                 if job is None:
                     return False
-                if job.starts > self._settings.starts:
-                    stage = job.stage or "reconstruct"
-                    jobs.finish(
-                        session, self.job_id, self.executor, "failed", _poisoned(stage, job.starts - 1, "worker")
-                    )
-                    return False
-                return True
+                error = self._hopeless(job.stage or "reconstruct", Setbacks.of(job.setbacks))
+                if error is not None:
+                    jobs.finish(session, self.job_id, self.executor, "failed", error)
+                return error is None
 
         return await self._thread(take)
 
@@ -123,8 +118,11 @@ class JobRun:
         seconds = {o["stage"]: float(o["seconds"]) for o in outcomes if "seconds" in o}
         report = None
         if error is None:
-            text = await self._thread(self._storage.read, f"{outcomes[-1]['prefix']}/report.json")
-            report = Report.model_validate_json(text)
+            try:
+                text = await self._thread(self._storage.read, f"{outcomes[-1]['prefix']}/report.json")
+                report = Report.model_validate_json(text)
+            except SpecimapError as away:
+                error = away.as_dict()
 
         def end() -> str:
             with self._database.session() as session:
@@ -193,7 +191,8 @@ class JobRun:
     def _publish(self, prefix: str) -> tuple[int, int]:
         with self._storage.publishing(prefix) as aside, disk_errors(aside):
             for name in (*RESULTS, *([SHEET] if (self._out / SHEET).exists() else [])):
-                shutil.move(self._out / name, aside / name)
+                # Linked, not moved: where the storage is away, this is done again.
+                link(self._out / name, aside / name)
             size = sum(p.stat().st_size for p in aside.rglob("*") if p.is_file())
             # Read here, where the cloud is on the local disk: the report does not hold it.
             from specimap_core.cloud import Cloud
@@ -224,14 +223,19 @@ class JobRun:
                     raise StageCrashedError("left something that is no file", [])
                 return seconds
             except StageCrashedError as crash:
-                for line in crash.tail:
-                    logger().error("stage's last lines", job=self.job_id, stage=stage, line=line)
-                starts = await self._thread(self._count_start)
-                await self._log("error", f"The process of stage {stage} {crash.reason}.", stage=stage, starts=starts)
-                if starts > self._settings.starts:
-                    raise _poisoned(stage, starts - 1, "process", crash.reason) from crash
+                logger().error(
+                    "stage's process ended", job=self.job_id, stage=stage, reason=crash.reason, last_lines=crash.tail
+                )
+                setbacks = await self._thread(self._set_back, uuid.uuid4().hex[:12], crash)
+                counts = {"crashes": len(setbacks.crashes), "interruptions": len(setbacks.interruptions)}
+                await self._log("error", f"The process of stage {stage} {crash.reason}.", stage=stage, **counts)
+                error = self._hopeless(stage, setbacks, crash.reason)
+                if error is not None:
+                    raise error from crash
+                pause = min(pause_seconds(len(setbacks.interruptions)) if crash.from_outside else 0.0, HELD_SECONDS)
             finally:
                 await process.end()
+            await asyncio.sleep(pause)
 
     async def _watch(self, process: StageProcess, spec: dict[str, Any], stage: str) -> float:
         last = 0.0
@@ -245,7 +249,7 @@ class JobRun:
             try:
                 await asyncio.to_thread(self._report_progress, stage, share)
             except DatabaseUnavailableError:
-                logger().warning("progress not written: the database is away", job=self.job_id, stage=stage)
+                logger().debug("progress not written: the database is away", job=self.job_id, stage=stage)
 
         return await process.run(spec, progress, self._settings.stage_seconds)
 
@@ -253,11 +257,13 @@ class JobRun:
         with self._database.session() as session:
             jobs.report_progress(session, self.job_id, self.executor, stage, share)  # type: ignore[arg-type]
 
-    def _count_start(self) -> int:
+    def _set_back(self, name: str, crash: StageCrashedError) -> Setbacks:
         with self._database.session() as session:
-            job = jobs.held(session, self.job_id, self.executor)
-            job.starts += 1
-            return job.starts
+            return jobs.set_back(session, self.job_id, self.executor, name, crash=not crash.from_outside)
+
+    def _hopeless(self, stage: str, setbacks: Setbacks, reason: str = "died") -> WorkerCrashedError | None:
+        limits = {"crashes": self._settings.starts, "interruptions": self._settings.interruptions}
+        return setbacks.failure(stage, reason, **limits)
 
     def _earlier(self, plan: Plan) -> list[tuple[str, float, bool]]:
         """Stages before that are done, with their seconds and whether this job found them done."""
@@ -291,16 +297,7 @@ class JobRun:
 
 def work_folder(scratch: Path, job_id: str, executor: str) -> Path:
     """Where an executor works on a job; no other one works there."""
-    return scratch / "work" / f"{job_id}.{executor.rsplit(':', 1)[-1]}"
-
-
-def _poisoned(stage: str, starts: int, what: str, reason: str = "died") -> WorkerCrashedError:
-    return WorkerCrashedError(
-        f"The {what} of stage {stage} {reason}, {starts} times in a row.",
-        advice="Look at the job's log; fewer or smaller photos need less memory.",
-        stage=stage,
-        starts=starts,
-    )
+    return scratch / "work" / f"{job_id}.{suffix_of(executor)}"
 
 
 __all__ = ["STAGES", "JobRun", "work_folder"]

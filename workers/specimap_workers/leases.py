@@ -11,8 +11,8 @@ import time
 from collections.abc import Callable
 
 import sqlalchemy as sa
-from sqlalchemy.dialects import postgresql, sqlite
 
+from specimap_infra import jobs
 from specimap_infra.database import Database, database_seconds
 from specimap_infra.errors import DatabaseUnavailableError
 from specimap_infra.logs import logger
@@ -20,7 +20,11 @@ from specimap_infra.tables import Lease
 
 
 class LeaseKeeper:
-    """Renews one worker's lease in a thread, and calls ``look_after`` now and then, when it may judge others."""
+    """Renews one worker's lease in a thread, and looks after others.
+
+    At every heartbeat ``look_after`` gets the executors that live, or None while it is too early to judge others by
+    their leases; ``settle`` is called once a lease.
+    """
 
     def __init__(
         self,
@@ -30,7 +34,8 @@ class LeaseKeeper:
         kind: str,
         heartbeat_seconds: float,
         lease_seconds: float,
-        look_after: Callable[[set[str]], None],
+        look_after: Callable[[set[str] | None], None],
+        settle: Callable[[], None],
     ) -> None:
         self._database = database
         self._executor = executor
@@ -39,6 +44,8 @@ class LeaseKeeper:
         self._heartbeat = heartbeat_seconds
         self._ttl = lease_seconds
         self._look_after = look_after
+        self._settle = settle
+        self._leased = False
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="lease", daemon=True)
 
@@ -59,7 +66,7 @@ class LeaseKeeper:
 
     def _run(self) -> None:
         steady: float | None = None
-        renewed = looked = time.monotonic()
+        renewed = settled = time.monotonic()
         while not self._stop.wait(self._heartbeat):
             try:
                 self._renew()
@@ -68,12 +75,14 @@ class LeaseKeeper:
                 if steady is None or now - renewed > self._ttl:
                     steady = now
                 renewed = now
-                if now - steady >= self._ttl and now - looked >= self._ttl / 4:
-                    looked = now
-                    self._look_after(self._living())
+                judging = now - steady >= self._ttl
+                self._look_after(self._living() if judging else None)
+                if judging and now - settled >= self._ttl:
+                    settled = now
+                    self._settle()
             except DatabaseUnavailableError:
+                # The log tells once that it is away.
                 steady = None
-                logger().warning("heartbeat missed: the database is away", executor=self._executor)
             except Exception:
                 # This thread must outlive any error: without it the worker would count as dead.
                 logger().exception("looking after others failed", executor=self._executor)
@@ -81,13 +90,14 @@ class LeaseKeeper:
     def _renew(self) -> None:
         now = database_seconds(self._database.engine)
         values = {"executor": self._executor, "host": self._host, "kind": self._kind, "started": now, "heartbeat": now}
-        insert = sqlite.insert if self._database.engine.dialect.name == "sqlite" else postgresql.insert
         with self._database.session() as session:
-            session.execute(
-                insert(Lease)
-                .values(**values)
-                .on_conflict_do_update(index_elements=[Lease.executor], set_={"heartbeat": now})
-            )
+            renewed = sa.update(Lease).where(Lease.executor == self._executor).values(heartbeat=now)
+            if session.execute(renewed.returning(Lease.executor)).first() is None:
+                session.execute(sa.insert(Lease).values(**values))
+                if self._leased:
+                    # Others took this worker for dead. It lives, so its jobs did not kill it.
+                    jobs.take_back(session, self._executor)
+        self._leased = True
 
     def _living(self) -> set[str]:
         """Executors whose lease is live; the others' leases are removed."""

@@ -15,6 +15,8 @@ from specimap_core.errors import SpecimapError
 from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES
 from specimap_core.sandbox.json_lines import JsonLineProcess, ProcessEndedError, end_text
 from specimap_infra.errors import StageTimeoutError
+from specimap_infra.setbacks import ended_from_outside
+from specimap_workers.memory import MemoryWatch, offer_to_memory_killer
 from specimap_workers.workspaces import Workspace, Workspaces
 
 COMMAND = (sys.executable, "-m", "specimap_workers.stage_main")
@@ -25,12 +27,16 @@ TICK_SECONDS = 0.2
 
 
 class StageCrashedError(Exception):
-    """A stage's process ended without an answer; ``reason`` in words, ``tail`` its last lines."""
+    """A stage's process ended without an answer; ``reason`` in words, ``tail`` its last lines.
 
-    def __init__(self, reason: str, tail: Sequence[str]) -> None:
+    ``from_outside``: another process ended it, which says nothing about the job.
+    """
+
+    def __init__(self, reason: str, tail: Sequence[str], *, from_outside: bool = False) -> None:
         super().__init__(reason)
         self.reason = reason
         self.tail = list(tail)
+        self.from_outside = from_outside
 
 
 class RefusedError(Exception):
@@ -56,6 +62,7 @@ class StageProcess:
         # It reads uploads, so it sees no password, and of Specimap's variables those of the backends alone. It is
         # started in this thread, not in one of a pool: it ends with the thread that started it.
         process = JsonLineProcess(confined, env=workspaces.environment(workspace, tuple(BACKEND_VARIABLES)))
+        offer_to_memory_killer(process.pid)
         return cls(process, workspace)
 
     @property
@@ -87,13 +94,16 @@ class StageProcess:
             await self.kill()
 
     async def _answer(self, progress: Callable[[str, float], Awaitable[None]]) -> float:
+        memory = MemoryWatch()
         while True:
             try:
                 event = await asyncio.to_thread(self._process.receive, TICK_SECONDS)
             except TimeoutError:
                 continue
             except ProcessEndedError as end:
-                raise StageCrashedError(_reason(end.status), end.tail) from end
+                ran_out = memory.ran_out()
+                outside = ended_from_outside(end.status, memory_ran_out=ran_out)
+                raise StageCrashedError(_reason(end.status, ran_out), end.tail, from_outside=outside) from end
             if event["event"] == "progress":
                 await progress(event["stage"], event["share"])
             elif event["event"] == "done":
@@ -112,8 +122,8 @@ class StageProcess:
         await asyncio.to_thread(self.workspace.remove)
 
 
-def _reason(status: int) -> str:
-    hint = " (often: out of memory)" if status == -signal.SIGKILL else ""
+def _reason(status: int, memory_ran_out: bool) -> str:
+    hint = " (out of memory)" if status == -signal.SIGKILL and memory_ran_out else ""
     return f"{'was ended' if status < 0 else 'ended'} {end_text(status)}{hint}"
 
 

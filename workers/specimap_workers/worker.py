@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import asyncio
-import fcntl
 import signal
-import socket
 import threading
 import time
-import uuid
 from collections.abc import Sequence
-from contextlib import suppress
-from typing import Any, TextIO
+from typing import Any, Self
 
 from dbos import DBOS, DBOSConfig
 
-from specimap_core.atomic import remove
 from specimap_core.errors import SpecimapError
 from specimap_core.reconstruct.backends.environment import BackendSettings
-from specimap_infra.database import Database
-from specimap_infra.errors import LostLeaseError
+from specimap_infra.database import Database, database_errors, make_engine
+from specimap_infra.errors import DatabaseUnavailableError, LostLeaseError
 from specimap_infra.logs import logger
+from specimap_infra.migrate import migrate
 from specimap_infra.queue import (
     APPLICATION,
     APPLICATION_VERSION,
@@ -35,9 +31,11 @@ from specimap_infra.queue import (
 from specimap_infra.settings import ServiceSettings
 from specimap_infra.storage import Storage
 from specimap_infra.webhooks import deliver_due, webhook_client
+from specimap_workers.executors import suffix_of
 from specimap_workers.exports import run_export
 from specimap_workers.job import STAGES, JobRun
 from specimap_workers.leases import LeaseKeeper
+from specimap_workers.presence import Presence
 from specimap_workers.reaper import Reaper
 from specimap_workers.stage_process import COMMAND, Processes
 from specimap_workers.workspaces import Workspaces
@@ -53,62 +51,88 @@ class Worker:
         self,
         settings: ServiceSettings,
         backends: BackendSettings,
+        executor: str,
         *,
-        slot: int = 0,
         kind: str = "cpu",
         command: Sequence[str] = COMMAND,
     ) -> None:
         self.settings = settings
         self._backends = backends
-        self.executor = f"{socket.gethostname()}:{slot}:{uuid.uuid4().hex[:12]}"
+        self.executor = executor
         self._database = Database.open(settings.database)
         self._storage = Storage.open(settings)
-        workspaces = Workspaces.of(settings, settings.scratch / "work", self._suffix, backends)
+        work = settings.scratch / "work"
+        self._presence = Presence(work, self.executor)
+        self._reaper = Reaper(self._database, queue_client(self._database.engine))
+        self._buried: set[str] = set()
+        workspaces = Workspaces.of(settings, work, suffix_of(self.executor), backends)
         self._processes = Processes(workspaces, command, memory_bytes=settings.stage_memory_bytes)
         self._kind = kind
         self._stopping = threading.Event()
-        self._note: TextIO | None = None
 
-    @property
-    def _suffix(self) -> str:
-        """How the names of this executor's folders end."""
-        return self.executor.rsplit(":", 1)[-1]
-
-    def run(self) -> None:
-        """Work until SIGTERM or SIGINT; the database has been migrated.
+    @classmethod
+    def ready(
+        cls,
+        settings: ServiceSettings,
+        backends: BackendSettings,
+        executor: str,
+        *,
+        kind: str = "cpu",
+        command: Sequence[str] = COMMAND,
+    ) -> Self:
+        """Make one once the database, which is brought to this version's schema, and the storage can be used.
 
         Raises:
-            DatabaseUnavailableError, StorageUnavailableError: nothing was started then.
+            DatabaseUnavailableError, StorageUnavailableError, OutputNotWritableError: they cannot; try again.
         """
-        self._storage.check_at_start()
+        database = Database.open(settings.database)
+        try:
+            migrate(database)
+            Storage.open(settings).check_at_start()
+        finally:
+            database.close()
+        return cls(settings, backends, executor, kind=kind, command=command)
+
+    def run(self) -> None:
+        """Work until SIGTERM or SIGINT.
+
+        Raises:
+            DatabaseUnavailableError: it went away before the work began.
+        """
+        self._presence.announce()
+        self._look_after(None)
         self._sweep()
         self._register()
         self._configure()
-        reaper = Reaper(self._database, queue_client(self._database.engine))
         keeper = LeaseKeeper(
             self._database,
             self.executor,
             kind=self._kind,
             heartbeat_seconds=self.settings.heartbeat_seconds,
             lease_seconds=self.settings.lease_seconds,
-            look_after=reaper.look_after,
+            look_after=self._look_after,
+            settle=self._reaper.settle,
         )
         keeper.start()
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: self._stopping.set())
         DBOS.listen_queues([JOBS, EXPORTS])
-        DBOS.launch()
-        for queue in (JOBS, EXPORTS):
-            DBOS.register_queue(
-                queue, worker_concurrency=1, polling_interval_sec=POLL_SECONDS, on_conflict="always_update"
-            )
+        with database_errors():
+            DBOS.launch()
+            for queue in (JOBS, EXPORTS):
+                DBOS.register_queue(
+                    queue, worker_concurrency=1, polling_interval_sec=POLL_SECONDS, on_conflict="always_update"
+                )
         logger().info("worker started", executor=self.executor)
         try:
             self._deliver_until_stopped()
         finally:
             # What runs is not waited for: its job goes on elsewhere from the last finished stage.
             DBOS.destroy(workflow_completion_timeout_sec=0)
-            reaper.hand_over(self.executor)
+            try:
+                self._reaper.hand_over(self.executor, died=False)
+            except DatabaseUnavailableError:
+                logger().warning("jobs not handed over yet: the database is away", executor=self.executor)
             keeper.stop()
             logger().info("worker stopped", executor=self.executor)
 
@@ -121,6 +145,8 @@ class Worker:
                     self._sweep()
                 try:
                     deliver_due(self._database, self.settings, client)
+                except DatabaseUnavailableError:
+                    pass  # they are delivered once it is back; the log tells that it is away
                 except SpecimapError as error:
                     logger().warning("webhooks not delivered", code=error.code)
 
@@ -137,6 +163,9 @@ class Worker:
             "log_level": "WARNING",
             "console_log_level": "ERROR",
         }
+        if self._database.engine.dialect.name != "sqlite":
+            # Of its own, since it holds connections for long; with limits to its waits, which the engine's have not.
+            config["system_database_engine"] = make_engine(self.settings.database)
         DBOS(config=config)
 
     def _register(self) -> None:
@@ -195,17 +224,15 @@ class Worker:
             backends=self._backends,
         )
 
+    def _look_after(self, living: set[str] | None) -> None:
+        """Hand over the work of the dead: of this machine's at once, of others' once their leases have run out."""
+        for executor in set(self._presence.dead()) - self._buried:
+            self._reaper.bury(executor)
+            self._buried.add(executor)
+        if living is not None:
+            self._reaper.look_after(living)
+
     def _sweep(self) -> None:
-        """Remove work folders of processes of this machine that are gone."""
-        work = self.settings.scratch / "work"
-        work.mkdir(parents=True, exist_ok=True, mode=0o700)
-        if self._note is None:
-            self._note = open(work / f"{self._suffix}.lock", "w", encoding="ascii")  # noqa: SIM115
-            fcntl.flock(self._note, fcntl.LOCK_EX)
-        for path in work.glob("*.lock"):
-            with suppress(OSError), open(path, encoding="ascii") as note:
-                # Locked as long as its worker lives, in whatever container; process ids repeat.
-                fcntl.flock(note, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                for folder in work.glob(f"*.{path.stem}"):
-                    remove(folder)
-                remove(path)
+        """Remove work folders of this machine's dead whose work has been handed over."""
+        for executor in set(self._presence.dead()) & self._buried:
+            self._presence.forget(executor)
