@@ -31,6 +31,7 @@ from bench.service.serving import COMMAND
 from specimap_client import Client, Retries
 from specimap_infra.database import Database, utc_now
 from specimap_infra.migrate import migrate
+from specimap_infra.projects import DEFAULT_PROJECT
 from specimap_infra.settings import ServiceSettings, load_settings
 from specimap_infra.tables import FINAL_STATES, Job, JobEvent
 from specimap_service.auth.keys import new_key
@@ -92,7 +93,7 @@ def measure(settings: ServiceSettings, options: Namespace) -> dict[str, Any]:
     """Submit the jobs, kill until all have ended, and count."""
     database = Database.open(settings.database)
     migrate(database)
-    row, key = new_key("bench", ["upload", "read"], rate_per_minute=10**9)
+    row, key = new_key("bench", ["upload", "read"], project_id=DEFAULT_PROJECT, rate_per_minute=10**9)
     with database.session() as session:
         session.add(row)
     with socket.create_server(("127.0.0.1", 0)) as free:

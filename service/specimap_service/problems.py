@@ -13,7 +13,6 @@ from pydantic.json_schema import models_json_schema
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
-from starlette.responses import Response
 
 from specimap_core.errors import SpecimapError
 from specimap_infra.database import database_errors

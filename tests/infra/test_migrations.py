@@ -159,7 +159,8 @@ def test_data_of_the_first_version_come_into_the_default_project(first: Database
     migrate(first)
     after = _contents(first)
     for table, rows in before.items():
-        kept = [{name: value for name, value in row.items() if name != "project_id"} for row in after[table]]
+        # Later versions only add columns.
+        kept = [{name: row[name] for name in rows[0]} for row in after[table]]
         if table == "api_keys":
             rows, kept = ([{k: v for k, v in row.items() if k != "scopes"} for row in part] for part in (rows, kept))
         assert sorted(kept, key=str) == sorted(rows, key=str), table

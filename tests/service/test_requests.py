@@ -40,6 +40,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Running, R
                 "upload_id": upload,
                 "uuid": upload,
                 "key_id": f"key_{'0' * 26}",
+                "project_id": DEFAULT_PROJECT,
             },
         )
 

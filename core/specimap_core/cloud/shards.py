@@ -85,7 +85,7 @@ class PointArray:
     @property
     def point_bytes(self) -> int:
         """Bytes of a point's values."""
-        return int(np.prod(self.shape[1:], dtype=np.int64)) * self.dtype.itemsize
+        return int(np.prod(self.shape[1:], dtype=np.int64)) * int(self.dtype.itemsize)
 
     def read(self, start: int, stop: int, out: Array | None = None) -> Array:
         """Values (stop - start, ...) of points [start, stop), into ``out`` if given.
