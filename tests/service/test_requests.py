@@ -10,6 +10,7 @@ from typing import Any
 import httpx
 import pytest
 
+from specimap_infra.projects import DEFAULT_PROJECT
 from tests.support.job_scene import queued_job
 from tests.support.result_scene import Result, put_result
 from tests.support.service_scene import Running, serving
