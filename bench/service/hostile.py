@@ -9,8 +9,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import count
-from multiprocessing.synchronize import Event
-from typing import Any
+from multiprocessing.connection import Connection
 
 import httpx
 import numpy as np
@@ -30,9 +29,9 @@ class Kind:
     make: Callable[[str], Callable[[], Ask]]
 
 
-def run_hostile(name: str, url: str, key: str, cloud_id: str, stop: Event, heard: Any) -> None:
-    """Ask until told to stop; then tell how many answers of each status came."""
-    kind = KINDS[name]
+def run_hostile(name: str, url: str, key: str, cloud_id: str, parent: Connection) -> None:
+    """Ask until the parent sends something; then tell it how many answers of each status came."""
+    kind, stop = KINDS[name], threading.Event()
     make, answers, lock = kind.make(cloud_id), Counter[str](), threading.Lock()
 
     def ask_on() -> None:
@@ -52,10 +51,11 @@ def run_hostile(name: str, url: str, key: str, cloud_id: str, stop: Event, heard
     threads = [threading.Thread(target=ask_on, daemon=True) for _ in range(kind.clients)]
     for thread in threads:
         thread.start()
-    heard.put("ready")
-    stop.wait()
+    parent.send("ready")
+    parent.recv()
+    stop.set()
     with lock:
-        heard.put(dict(answers))
+        parent.send(dict(answers))
 
 
 # ---- what is asked ------------------------------------------------------------------------------------

@@ -8,7 +8,6 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any
 
@@ -88,23 +87,23 @@ def _beside(served: Served, name: str, cloud_id: str) -> Iterator[Counter[str]]:
         yield answers
         return
     context = multiprocessing.get_context("spawn")
-    stop: Event = context.Event()
-    heard: Any = context.Queue()
-    process = context.Process(target=run_hostile, args=(name, served.url, _key(served, name), cloud_id, stop, heard))
+    here, there = context.Pipe()
+    process = context.Process(target=run_hostile, args=(name, served.url, _key(served, name), cloud_id, there))
     process.start()
     try:
-        if heard.get(timeout=PATIENCE_SECONDS) != "ready":
+        if not here.poll(PATIENCE_SECONDS) or here.recv() != "ready":
             raise RuntimeError("the hostile client does not start")
         time.sleep(SETTLE_SECONDS)
         yield answers
         if not process.is_alive():
             raise RuntimeError("the hostile client has ended")
-        stop.set()
-        answers.update(heard.get(timeout=PATIENCE_SECONDS))
+        here.send("stop")
+        if not here.poll(PATIENCE_SECONDS):
+            raise RuntimeError("the hostile client does not stop")
+        answers.update(here.recv())
     finally:
-        stop.set()
-        process.join(30)
         process.kill()
+        process.join()
 
 
 def _key(served: Served, name: str) -> str:
