@@ -21,6 +21,7 @@ from bench.service.scene import put_result
 from bench.service.serving import Served, serving
 from bench.service.sheet import Sheet, reached
 from bench.service.wire import Connection, request
+from specimap_core.atomic import remove
 
 SECONDS = 15.0
 SETTLE_SECONDS = 3.0
@@ -35,15 +36,18 @@ NAMES = {"alone": "nobody", **{name: kind.words for name, kind in KINDS.items()}
 def bench_neighbour(work: Path, options: Options) -> dict[str, Any]:
     """Measure another key's requests alone, then beside each kind of hostile key, ``repeats`` times."""
     figures: dict[str, Any] = {"seconds": SECONDS, "runs": {name: [] for name in NAMES}}
-    with serving(work / "neighbour") as served:
-        result = put_result(served, work)
-        figures |= {"points": result.cloud.n_points, "bands": result.cloud.bands}
-        _measured(served, result.cloud_id, 2.0)
-        for _ in range(options.repeats):
-            for name in NAMES:
+    for k in range(options.repeats):
+        for name in NAMES:
+            # A service of its own: what one hostile key has left in the queues would count as a second one.
+            folder = work / f"neighbour-{name}-{k}"
+            with serving(folder) as served:
+                result = put_result(served, work)
+                figures |= {"points": result.cloud.n_points, "bands": result.cloud.bands}
+                _measured(served, result.cloud_id, 2.0)
                 with _beside(served, name, result.cloud_id) as answers:
                     run = _measured(served, result.cloud_id, SECONDS)
                 figures["runs"][name].append(run | {"hostile": dict(answers)})
+            remove(folder)
     return figures
 
 
