@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from specimap_cli.invocation import program
 from specimap_cli.progress import Listener, UploadBar
 from specimap_core.atomic import atomic_path, remove
 from specimap_core.errors import BackendUnavailableError, NotFoundError, SpecimapError
@@ -58,8 +59,8 @@ def demo(samples: Path, out: Path, listener: Listener, *, stay: bool, say: Calla
             say(f"The service goes on: the API is described at {url}/docs, the demo's key is {key}")
             say("Ctrl-C ends it.")
             threading.Event().wait()
-    say(f"To serve these results again: export SPECIMAP_DATA_DIR={out / 'service'}; specimap serve")
-    say("A key for it: specimap keys create --name me --scope admin")
+    say(f"To serve these results again: export SPECIMAP_DATA_DIR={out / 'service'}; {program()} serve")
+    say(f"A key for it: {program()} keys create --name me --scope admin")
 
 
 def _run(
