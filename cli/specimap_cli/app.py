@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from specimap_cli import run_options
+from specimap_cli.backup import backup, restore
 from specimap_cli.doctor import doctor
 from specimap_cli.errors import Debug, reported_errors, stoppable
 from specimap_cli.keys import keys_app
@@ -207,6 +208,8 @@ def _root(
 app.command()(report)
 app.command()(validate)
 app.command()(doctor)
+app.command()(backup)
+app.command()(restore)
 app.add_typer(study_app, name="study")
 app.add_typer(keys_app, name="keys")
 app.add_typer(projects_app, name="projects")

@@ -15,6 +15,7 @@ from alembic.config import Config
 from dbos import DBOS
 
 from specimap_infra.database import Database, database_errors
+from specimap_infra.schema_version import refuse_newer
 from specimap_infra.tables import Base
 
 LOCK = 7261534
@@ -33,9 +34,11 @@ def migrate(database: Database) -> None:
     """Create or upgrade all tables; programs that start together wait for each other.
 
     Raises:
+        DatabaseTooNewError: a newer release was there before; nothing was changed.
         DatabaseUnavailableError: the server cannot be reached.
     """
     with database_errors(), exclusive_lock(database.engine):
+        refuse_newer(database.engine)
         # The engine's own function, since its client never migrates.
         DBOS.migrate(database.engine.url.render_as_string(hide_password=False))
         with database.engine.connect() as connection, whole(connection):
