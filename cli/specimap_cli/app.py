@@ -18,6 +18,7 @@ from specimap_cli.keys import keys_app
 from specimap_cli.progress import Listener, json_listener, progress_listener
 from specimap_cli.projects import projects_app
 from specimap_cli.report import report
+from specimap_cli.storage import storage_app
 from specimap_cli.validation import study_app, validate
 from specimap_core import __version__
 from specimap_core.json_text import json_text
@@ -213,3 +214,4 @@ app.command()(restore)
 app.add_typer(study_app, name="study")
 app.add_typer(keys_app, name="keys")
 app.add_typer(projects_app, name="projects")
+app.add_typer(storage_app, name="storage")

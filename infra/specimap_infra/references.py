@@ -38,7 +38,7 @@ class Reference:
     """Of a file; empty where the row does not know."""
 
 
-def reference_of(table: str, row: Mapping[str, Any]) -> Reference | None:
+def reference_of(table: str, row: Mapping[Any, Any]) -> Reference | None:
     """Return what a row refers to; None where it refers to no file."""
     column, folder = COLUMNS.get(table, ("", False))
     key = row[column] if column else None

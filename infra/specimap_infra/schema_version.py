@@ -9,11 +9,17 @@ import sqlalchemy as sa
 from alembic.script import ScriptDirectory
 from dbos._migration import get_migration_versions, get_sqlite_migration_versions
 
+from specimap_core.errors import SettingsError
 from specimap_infra import migrations
 from specimap_infra.errors import DatabaseTooNewError
 
 ENGINE_SCHEMA = "dbos"
 """Where the job engine keeps its tables in PostgreSQL; SQLite has one schema for all."""
+
+
+def engine_schema(dialect: sa.Dialect) -> str | None:
+    """Return the schema of the job engine's tables; None where there is one schema for all."""
+    return None if dialect.name == "sqlite" else ENGINE_SCHEMA
 
 
 @cache
@@ -47,6 +53,24 @@ def refuse_newer(engine: sa.Engine) -> None:
         found, latest = get_migration_versions(engine, ENGINE_SCHEMA, use_listen_notify=True)
     if found > latest:
         raise _too_new(f"version {found} of the job engine's tables", f"version {latest}", str(found))
+
+
+def refuse_older(engine: sa.Engine) -> None:
+    """Refuse a database that has not been brought to this release's schema, for what does not do that itself.
+
+    Raises:
+        SettingsError: it holds no tables of Specimap, or older ones.
+        DatabaseTooNewError: as of :func:`refuse_newer`.
+    """
+    refuse_newer(engine)
+    with engine.connect() as connection:
+        revision = revision_of(connection)
+    if revision != known_revisions()[0]:
+        raise SettingsError(
+            f"The database has {'no tables' if revision is None else f'schema {revision}'} of Specimap; "
+            f"this release needs {known_revisions()[0]}.",
+            advice="Start the service of this release first, which upgrades the database.",
+        )
 
 
 def _too_new(found: str, known: str, version: str) -> DatabaseTooNewError:

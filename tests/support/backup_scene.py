@@ -9,6 +9,7 @@ import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import httpx
 
@@ -23,9 +24,9 @@ AWS = {"AWS_ACCESS_KEY_ID": "test", "AWS_SECRET_ACCESS_KEY": "test"}
 
 
 @contextmanager
-def place(kind: str, folder: Path) -> Iterator[dict[str, object]]:
+def place(kind: str, folder: Path) -> Iterator[dict[str, Any]]:
     """Settings of an empty ``local`` place (SQLite, a folder), or of a ``shared`` one (PostgreSQL, an S3 store)."""
-    settings: dict[str, object] = {"data_dir": folder, "min_free_bytes": 0}
+    settings: dict[str, Any] = {"data_dir": folder, "min_free_bytes": 0}
     with ExitStack() as stack:
         if kind == "shared":
             settings["database_url"] = stack.enter_context(postgres_url())

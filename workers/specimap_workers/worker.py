@@ -20,6 +20,7 @@ from specimap_core.errors import SpecimapError
 from specimap_core.reconstruct.backends.environment import BackendSettings
 from specimap_infra.database import Database
 from specimap_infra.errors import LostLeaseError
+from specimap_infra.housekeeping import Housekeeping
 from specimap_infra.logs import logger
 from specimap_infra.queue import (
     APPLICATION,
@@ -103,6 +104,8 @@ class Worker:
                 queue, worker_concurrency=1, polling_interval_sec=POLL_SECONDS, on_conflict="always_update"
             )
         logger().info("worker started", executor=self.executor)
+        housekeeping = Housekeeping(self._database, self._storage, self.settings, queue_client(self._database.engine))
+        housekeeping.start()
         try:
             self._deliver_until_stopped()
         finally:
@@ -110,6 +113,7 @@ class Worker:
             DBOS.destroy(workflow_completion_timeout_sec=0)
             reaper.hand_over(self.executor)
             keeper.stop()
+            housekeeping.stop()
             logger().info("worker stopped", executor=self.executor)
 
     def _deliver_until_stopped(self) -> None:

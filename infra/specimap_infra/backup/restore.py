@@ -15,7 +15,7 @@ from dbos import DBOS
 from sqlalchemy.orm import Session
 
 from specimap_core.atomic import disk_errors, remove
-from specimap_core.errors import CancelledError, NotFoundError, SpecimapError
+from specimap_core.errors import CancelledError
 from specimap_infra import jobs
 from specimap_infra.backup.manifest import (
     FILES,
@@ -31,18 +31,17 @@ from specimap_infra.backup.manifest import (
     read_entries,
     read_manifest,
 )
-from specimap_infra.backup.rows import LEFT_OUT, load_rows
+from specimap_infra.backup.rows import load_rows
+from specimap_infra.backup.target import refuse_rows, refuse_used_database, refuse_used_storage, sqlite_file
 from specimap_infra.database import Database, database_errors
-from specimap_infra.errors import BackupInvalidError, RestoreTargetError
+from specimap_infra.errors import BackupInvalidError
 from specimap_infra.migrate import alembic_config, exclusive_lock, whole
 from specimap_infra.private_files import JOURNALS
-from specimap_infra.projects import DEFAULT_PROJECT
 from specimap_infra.queue import EXPORTS, JOBS, MAKE_EXPORT, RUN_JOB, enqueue, queue_client
-from specimap_infra.references import PLACES
-from specimap_infra.schema_version import ENGINE_SCHEMA, known_revisions, refuse_newer
+from specimap_infra.schema_version import known_revisions
 from specimap_infra.settings import ServiceSettings
 from specimap_infra.storage import TEMPORARY, Storage
-from specimap_infra.tables import FINAL_STATES, PRIORITIES, Base, Export, Job, Project, Upload
+from specimap_infra.tables import FINAL_STATES, PRIORITIES, Base, Export, Job, Upload
 
 
 def check_backup(
@@ -85,9 +84,9 @@ def restore_backup(
         DatabaseTooNewError, DatabaseUnavailableError, StorageUnavailableError, StorageFullError.
     """
     manifest, entries = _read(source)
-    _refuse_used_database(settings.database)
+    refuse_used_database(settings.database)
     storage = Storage.open(settings)
-    present = _refuse_used_storage(storage, entries)
+    present = refuse_used_storage(storage, entries)
     _restore_files(storage, settings, source, entries, present, progress, cancelled)
     progress("rows", 0.0)
     _restore_rows(settings.database, source / ROWS, manifest)
@@ -108,67 +107,6 @@ def _read(source: Path) -> tuple[Manifest, list[Entry]]:
     return manifest, read_entries(source, manifest)
 
 
-# ---- the target ---------------------------------------------------------------------------------------
-
-
-def _sqlite_file(url: str) -> Path | None:
-    parsed = sa.make_url(url)
-    return Path(str(parsed.database)) if parsed.get_backend_name() == "sqlite" else None
-
-
-def _refuse_used_database(url: str) -> None:
-    file = _sqlite_file(url)
-    if file is not None and (not file.exists() or file.stat().st_size == 0):
-        return
-    database = Database.open(url)
-    try:
-        with database_errors():
-            refuse_newer(database.engine)
-            _refuse_rows(database.engine)
-    finally:
-        database.close()
-
-
-def _refuse_rows(engine: sa.Engine) -> None:
-    with engine.connect() as connection:
-        there = set(sa.inspect(connection).get_table_names())
-        for table in Base.metadata.sorted_tables:
-            if table.name not in there or table.name in LEFT_OUT:
-                continue
-            query = sa.select(sa.literal(1)).select_from(table).limit(1)
-            if table is Project.__table__:
-                # Made with the tables.
-                query = query.where(Project.id != DEFAULT_PROJECT)
-            if connection.execute(query).first() is not None:
-                raise _used(f"the database ({table.name})")
-        schema = None if engine.dialect.name == "sqlite" else ENGINE_SCHEMA
-        if sa.inspect(connection).has_table("workflow_status", schema=schema):
-            workflows = sa.table("workflow_status", schema=schema)
-            if connection.execute(sa.select(sa.literal(1)).select_from(workflows).limit(1)).first() is not None:
-                raise _used("the database (the queue of jobs)")
-
-
-def _refuse_used_storage(storage: Storage, entries: Sequence[Entry]) -> set[str]:
-    """Return the keys that are there already, from a restore of the same backup that was stopped."""
-    known, present = {entry.key for entry in entries}, set()
-    for place in PLACES:
-        try:
-            for item in storage.list(place):
-                if item.key not in known:
-                    raise _used(f"the storage ({item.key})")
-                present.add(item.key)
-        except NotFoundError:
-            continue
-    return present
-
-
-def _used(what: str) -> RestoreTargetError:
-    return RestoreTargetError(
-        f"A backup is restored into an empty service only; {what} holds data already. Nothing was changed.",
-        advice="Name another database and storage, or stop the service and remove its data folder first.",
-    )
-
-
 # ---- files --------------------------------------------------------------------------------------------
 
 
@@ -181,39 +119,51 @@ def _restore_files(
     progress: Progress,
     cancelled: Cancelled,
 ) -> None:
+    past, total = 0, sum(entry.size for entry in entries)
+    for entry in entries:
+        if cancelled():
+            raise CancelledError("The restore was stopped.", advice="Give the same command again to continue.")
+        if (
+            entry.key not in present
+            or storage.stat(entry.key).size != entry.size
+            or _digest(storage.stream(entry.key)) != entry.sha256
+        ):
+            restore_file(storage, settings, source, entry, cancelled)
+        past += entry.size
+        progress("files", past / max(total, 1))
+
+
+def restore_file(
+    storage: Storage, settings: ServiceSettings, source: Path, entry: Entry, cancelled: Cancelled = lambda: False
+) -> None:
+    """Store a file of a backup, whole and checked.
+
+    Raises:
+        BackupInvalidError: the file is missing or differs from what was saved.
+        CancelledError: ``cancelled`` came true.
+        StorageUnavailableError, StorageFullError.
+    """
     # On the storage's own disk, where a rename is enough.
     folder = settings.scratch if storage.folder is None else storage.folder / TEMPORARY
     aside = folder / f"restore-{uuid.uuid4().hex}.tmp"
-    past, total = 0, sum(entry.size for entry in entries)
     try:
-        for entry in entries:
-            if cancelled():
-                raise CancelledError("The restore was stopped.", advice="Give the same command again to continue.")
-            if entry.key not in present or storage.stat(entry.key).size != entry.size:
-                _restore_file(storage, source, entry, aside, cancelled)
-            elif _digest(storage.stream(entry.key)) != entry.sha256:
-                storage.delete(entry.key)
-                _restore_file(storage, source, entry, aside, cancelled)
-            past += entry.size
-            progress("files", past / max(total, 1))
+        with disk_errors(aside), _as_saved(entry, source):
+            size, digest = hashed(pieces_of(source / FILES / entry.key), aside, cancelled)
+        if (size, digest) != (entry.size, entry.sha256):
+            raise changed(entry.key)
+        storage.put_file(entry.key, aside)
     finally:
         remove(aside)
 
 
-def _restore_file(storage: Storage, source: Path, entry: Entry, aside: Path, cancelled: Cancelled) -> None:
-    remove(aside)
+@contextmanager
+def _as_saved(entry: Entry, source: Path) -> Iterator[None]:
     try:
-        with disk_errors(aside):
-            size, digest = hashed(pieces_of(source / FILES / entry.key), aside, cancelled)
+        yield
     except FileNotFoundError as error:
+        if (source / FILES / entry.key).exists():
+            raise
         raise changed(entry.key) from error
-    except SpecimapError as error:
-        if isinstance(error.__cause__, FileNotFoundError):
-            raise changed(entry.key) from error
-        raise
-    if (size, digest) != (entry.size, entry.sha256):
-        raise changed(entry.key)
-    storage.put_file(entry.key, aside)
 
 
 def _digest(pieces: Iterator[bytes]) -> str:
@@ -227,13 +177,13 @@ def _digest(pieces: Iterator[bytes]) -> str:
 
 
 def _restore_rows(url: str, rows: Path, manifest: Manifest) -> None:
-    file = _sqlite_file(url)
+    file = sqlite_file(url)
     if file is None:
         database = Database.open(url)
         try:
             # Programs that start meanwhile wait for the tables.
             with database_errors(), exclusive_lock(database.engine):
-                _refuse_rows(database.engine)
+                refuse_rows(database.engine)
                 _fill(database, rows, manifest)
         finally:
             database.close()
@@ -256,7 +206,7 @@ def _sqlite_aside(file: Path) -> Iterator[Path]:
     try:
         with disk_errors(file), exclusive_lock(target.engine):
             # A service may have been started on the empty database since it was looked at.
-            _refuse_rows(target.engine)
+            refuse_rows(target.engine)
             target.close()
             yield aside
             with open(aside, "rb") as written:
