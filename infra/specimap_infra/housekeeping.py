@@ -43,7 +43,7 @@ from specimap_infra.tables import (
 
 BATCH = 200
 """Rows, or jobs, of one transaction: others wait for no more than that."""
-FIRST_SECONDS = 60.0
+FIRST_SECONDS = 5.0
 EVERY_SECONDS = 3600.0
 STOP_SECONDS = 3.0
 LEFTOVER_SECONDS = 24 * 3600.0

@@ -34,6 +34,7 @@ from specimap_infra.tables import (
 from tests.support.job_scene import EXECUTOR, acquisition, queued_job
 from tests.support.result_scene import put_label, put_result
 from tests.support.service_scene import Running
+from tests.support.worker_scene import QUICK, shop, until
 
 OLD = utc_now() - datetime.timedelta(days=4000)
 NEVER: dict[str, Any] = {
@@ -273,3 +274,13 @@ def test_metrics_count_what_is_kept(service: Running, tmp_path: Path) -> None:
         assert line in text
     kinds = ("artefacts", "audit", "deliveries", "events", "exports", "labels", "leases", "uploads", "workflows")
     assert all(f'specimap_rows_keep{{kind="{kind}"}}' in text for kind in kinds)
+
+
+@pytest.mark.slow
+def test_a_worker_sweeps_while_it_works(tmp_path: Path) -> None:
+    with shop(tmp_path / "shop") as yard:
+        owner = acquisition(yard.database)
+        job_with_history(yard.database, owner, ended=True)
+        gone = artefact(yard.database, yard.storage, owner, "render", OLD)
+        yard.start(QUICK)
+        until(lambda: not is_stored(yard.storage, gone), 60, "the sweep")
