@@ -5,6 +5,8 @@ from __future__ import annotations
 import datetime
 import gzip
 import json
+import os
+import signal
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -39,11 +41,11 @@ from specimap_infra.tables import (
     StoredFile,
     Upload,
 )
-from tests.support.backup_scene import answers, place, specimap, stored
+from tests.support.backup_scene import answers, place, specimap, started, stored
 from tests.support.databases import create_tables
 from tests.support.result_scene import Result, put_label, put_result
 from tests.support.service_scene import Running, serving
-from tests.support.worker_scene import QUICK, Shop, shop
+from tests.support.worker_scene import QUICK, Shop, shop, until
 
 
 def add_artefact(database: Database, storage: Storage, acquisition_id: str, stage: str = "render") -> str:
@@ -380,6 +382,27 @@ def test_a_backup_that_is_stopped_leaves_nothing(service: Running, result: Resul
     create_backup(service.database, service.storage, folder / "one")
     with pytest.raises(OutputExistsError):
         create_backup(service.database, service.storage, folder / "one")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_stops_a_backup_in_the_middle_of_a_file(service: Running, tmp_path: Path, number: int) -> None:
+    yard = Shop(service.settings, {}, service.database, service.storage, tmp_path)
+    yard.acquisition(*fake_capture(tmp_path / "capture"))
+    with service.database.session() as session:
+        (key,) = session.scalars(sa.select(StoredFile.storage_key).where(StoredFile.label == "cube.raw")).all()
+    large = service.storage.path(key)
+    assert large is not None
+    os.truncate(large, 8 * 1024**3)  # takes no space
+    backups = tmp_path / "backups"
+    backups.mkdir()
+    with started({"data_dir": service.settings.data_dir}, "backup", "--to", str(backups / "one")) as program:
+        until(lambda: any(path.stat().st_size > 1024**2 for path in backups.rglob("file_*")), 30, "the large file")
+        program.send_signal(number)
+        _, told = program.communicate(timeout=30)
+    assert program.returncode == 130, told
+    assert "cancelled" in told
+    assert list(backups.iterdir()) == []
 
 
 def test_a_restore_that_is_stopped_goes_on(restored_pair: tuple[Running, ServiceSettings], tmp_path: Path) -> None:

@@ -39,10 +39,22 @@ def place(kind: str, folder: Path) -> Iterator[dict[str, Any]]:
 
 def specimap(given: Mapping[str, object], *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run the program with these settings."""
+    with started(given, *arguments) as program:
+        out, err = program.communicate(timeout=120)
+    return subprocess.CompletedProcess(arguments, program.returncode, out, err)
+
+
+@contextmanager
+def started(given: Mapping[str, object], *arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """Start the program with these settings; it does not outlive the block."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("SPECIMAP_")} | AWS
     environment |= {f"SPECIMAP_{name.upper()}": str(value) for name, value in given.items()}
-    command = [sys.executable, "-W", "error", "-c", PROGRAM, *arguments]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    command, pipe = [sys.executable, "-W", "error", "-c", PROGRAM, *arguments], subprocess.PIPE
+    with subprocess.Popen(command, env=environment, stdout=pipe, stderr=pipe, text=True) as program:
+        try:
+            yield program
+        finally:
+            program.kill()
 
 
 def answers(client: httpx.Client, cloud_id: str) -> dict[str, bytes]:
