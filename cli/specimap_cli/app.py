@@ -11,12 +11,14 @@ from typing import Annotated
 import typer
 
 from specimap_cli import run_options
+from specimap_cli.backup import backup, restore
 from specimap_cli.doctor import doctor
 from specimap_cli.errors import Debug, reported_errors, stoppable
 from specimap_cli.keys import keys_app
 from specimap_cli.progress import Listener, json_listener, progress_listener
 from specimap_cli.projects import projects_app
 from specimap_cli.report import report
+from specimap_cli.storage import storage_app
 from specimap_cli.validation import study_app, validate
 from specimap_core import __version__
 from specimap_core.json_text import json_text
@@ -207,6 +209,9 @@ def _root(
 app.command()(report)
 app.command()(validate)
 app.command()(doctor)
+app.command()(backup)
+app.command()(restore)
 app.add_typer(study_app, name="study")
 app.add_typer(keys_app, name="keys")
 app.add_typer(projects_app, name="projects")
+app.add_typer(storage_app, name="storage")

@@ -45,6 +45,10 @@ class Listener(Protocol):
         """A run by another process is finished."""
         ...
 
+    def kept(self, event: str, sentence: str, **facts: object) -> None:
+        """A command about the service's data is done: a sentence for a person, facts for a program."""
+        ...
+
     def refused(self, error: SpecimapError) -> None:
         """The run was refused or failed for a stated reason."""
         ...
@@ -86,6 +90,9 @@ class _Bars:
         for name in ("cloud", "mesh", "preview", "report"):
             sys.stdout.write(f"{name:<8} {getattr(outputs, name)}\n")
 
+    def kept(self, event: str, sentence: str, **facts: object) -> None:
+        sys.stdout.write(sentence + "\n")
+
     def refused(self, error: SpecimapError) -> None:
         # Paths may hold square brackets, which rich would take for markup.
         self._console.print(f"[bold red]{error.code}[/]: {escape(error.message)}", highlight=False, soft_wrap=True)
@@ -122,6 +129,9 @@ class _Lines:
 
     def finished(self, report: Report, outputs: Outputs) -> None:
         self._write(event="finished", out=str(outputs.folder), report=report.model_dump(mode="json"))
+
+    def kept(self, event: str, sentence: str, **facts: object) -> None:
+        self._write(event=event, **facts)
 
     def refused(self, error: SpecimapError) -> None:
         self._write(event="refused", **error.as_dict())

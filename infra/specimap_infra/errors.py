@@ -39,3 +39,21 @@ class DatabaseUnavailableError(SpecimapError, RuntimeError):
     """The database cannot be reached."""
 
     code = "database_unavailable"
+
+
+class DatabaseTooNewError(SpecimapError, RuntimeError):
+    """A newer release has brought the database to its schema; ``details['version']``."""
+
+    code = "database_too_new"
+
+
+class BackupInvalidError(SpecimapError, ValueError):
+    """A backup is not whole, not as it was made, or of a newer release."""
+
+    code = "backup_invalid"
+
+
+class RestoreTargetError(SpecimapError, FileExistsError):
+    """A backup would be restored over data."""
+
+    code = "restore_target_not_empty"

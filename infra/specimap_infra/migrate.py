@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -16,10 +17,12 @@ from dbos import DBOS
 
 from specimap_infra.database import Database, database_errors
 from specimap_infra.postgres import unhurried
+from specimap_infra.schema_version import refuse_newer
 from specimap_infra.tables import Base
 
 LOCK = 7261534
 """Number of the PostgreSQL advisory lock; any number that nothing else in the database uses."""
+LOCK_POLL_SECONDS = 0.1
 
 
 def alembic_config(connection: sa.Connection | None = None) -> Config:
@@ -34,9 +37,11 @@ def migrate(database: Database) -> None:
     """Create or upgrade all tables; programs that start together wait for each other.
 
     Raises:
+        DatabaseTooNewError: a newer release was there before; nothing was changed.
         DatabaseUnavailableError: the server cannot be reached.
     """
     with database_errors(), exclusive_lock(database.engine):
+        refuse_newer(database.engine)
         # The engine's own function, since its client never migrates.
         DBOS.migrate(database.engine.url.render_as_string(hide_password=False))
         with database.engine.connect() as connection, unhurried(connection), whole(connection):
@@ -84,8 +89,10 @@ def exclusive_lock(engine: sa.Engine) -> Iterator[None]:
         return
     # Outside a transaction: the engine builds indexes concurrently, which waits for open ones.
     with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
-        with unhurried(connection):
-            connection.execute(sa.text("SELECT pg_advisory_lock(:n)"), {"n": LOCK})
+        # Asked for again and again: a statement that waits holds a snapshot, and a concurrent build of an index waits
+        # for all snapshots, so the holder of the lock and those who wait for it would wait for each other.
+        while not connection.scalar(sa.text("SELECT pg_try_advisory_lock(:n)"), {"n": LOCK}):
+            time.sleep(LOCK_POLL_SECONDS)
         try:
             yield
         finally:

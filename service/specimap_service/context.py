@@ -39,7 +39,7 @@ class AppContext:
         """
         database = Database.open(settings.database)
         storage = Storage.open(settings)
-        return cls(settings, database, storage, queue_client(database.engine), Metrics(database, storage))
+        return cls(settings, database, storage, queue_client(database.engine), Metrics(database, storage, settings))
 
     def close(self) -> None:
         """Close the connections."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 
 import sqlalchemy as sa
@@ -11,16 +12,20 @@ from prometheus_client.registry import Collector
 
 from specimap_infra.database import Database, utc_now
 from specimap_infra.errors import DatabaseUnavailableError, StorageUnavailableError
+from specimap_infra.housekeeping import count_rows, scratch_bytes
+from specimap_infra.settings import ServiceSettings
 from specimap_infra.storage import Storage
-from specimap_infra.tables import JOB_STATES, Artefact, CloudRow, Job, LabelVersion, Lease, StoredFile
+from specimap_infra.tables import JOB_STATES, Artefact, CloudRow, Export, Job, LabelVersion, Lease, StoredFile
 
 REQUEST_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 60)
+COUNTED_SECONDS = 60.0
+"""How long counts of large tables are served before they are counted again."""
 
 
 class Metrics:
     """The metrics of one app."""
 
-    def __init__(self, database: Database, storage: Storage) -> None:
+    def __init__(self, database: Database, storage: Storage, settings: ServiceSettings) -> None:
         self.registry = CollectorRegistry()
         self._requests = Histogram(
             "specimap_requests_handle_seconds",
@@ -33,7 +38,7 @@ class Metrics:
         self.judged = Counter(
             "specimap_files_judge_total", "Files judged on arrival, by verdict.", ("verdict",), registry=self.registry
         )
-        self.registry.register(_FromDatabase(database, storage))
+        self.registry.register(_FromDatabase(database, storage, settings))
 
     def observe_request(self, method: str, route: str, status: int, seconds: float) -> None:
         """Count one request; ``status`` 0: the client disconnected."""
@@ -45,9 +50,13 @@ class Metrics:
 
 
 class _FromDatabase(Collector):
-    def __init__(self, database: Database, storage: Storage) -> None:
+    def __init__(self, database: Database, storage: Storage, settings: ServiceSettings) -> None:
         self._database = database
         self._storage = storage
+        self._settings = settings
+        self._counted: dict[str, int] | None = None
+        self._counted_at = 0.0
+        self._scratch = 0
 
     def describe(self) -> list[GaugeMetricFamily]:
         """Describe nothing, so that registering does not query the database."""
@@ -58,6 +67,7 @@ class _FromDatabase(Collector):
         try:
             yield from self._jobs()
             yield from self._stored()
+            yield from self._kept()
         except DatabaseUnavailableError:
             return
 
@@ -100,6 +110,7 @@ class _FromDatabase(Collector):
                 "artefacts": session.scalar(sa.select(sa.func.sum(Artefact.size))),
                 "clouds": session.scalar(sa.select(sa.func.sum(CloudRow.size))),
                 "labels": session.scalar(sa.select(sa.func.sum(LabelVersion.size))),
+                "exports": session.scalar(sa.select(sa.func.sum(Export.size))),
             }
         stored = GaugeMetricFamily("specimap_storage_use_bytes", "Stored bytes by kind.", labels=("kind",))
         for kind, size in sizes.items():
@@ -111,3 +122,15 @@ class _FromDatabase(Collector):
             free = None
         if free is not None:
             yield GaugeMetricFamily("specimap_storage_free_bytes", "Free space of the storage.", value=float(free))
+
+    def _kept(self) -> Iterator[GaugeMetricFamily]:
+        if self._counted is None or time.monotonic() - self._counted_at > COUNTED_SECONDS:
+            with self._database.session() as session:
+                self._counted = count_rows(session)
+            self._scratch = scratch_bytes(self._settings)
+            self._counted_at = time.monotonic()
+        rows = GaugeMetricFamily("specimap_rows_keep", "Rows of what is kept by rule.", labels=("kind",))
+        for kind, count in sorted(self._counted.items()):
+            rows.add_metric((kind,), count)
+        yield rows
+        yield GaugeMetricFamily("specimap_scratch_use_bytes", "Bytes in the scratch folder.", value=self._scratch)

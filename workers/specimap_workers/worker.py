@@ -15,6 +15,7 @@ from specimap_core.errors import SpecimapError
 from specimap_core.reconstruct.backends.environment import BackendSettings
 from specimap_infra.database import Database, database_errors, make_engine
 from specimap_infra.errors import DatabaseUnavailableError, LostLeaseError
+from specimap_infra.housekeeping import Housekeeping
 from specimap_infra.logs import logger
 from specimap_infra.migrate import migrate
 from specimap_infra.queue import (
@@ -124,6 +125,8 @@ class Worker:
                     queue, worker_concurrency=1, polling_interval_sec=POLL_SECONDS, on_conflict="always_update"
                 )
         logger().info("worker started", executor=self.executor)
+        housekeeping = Housekeeping(self._database, self._storage, self.settings, queue_client(self._database.engine))
+        housekeeping.start()
         try:
             self._deliver_until_stopped()
         finally:
@@ -134,6 +137,7 @@ class Worker:
             except DatabaseUnavailableError:
                 logger().warning("jobs not handed over yet: the database is away", executor=self.executor)
             keeper.stop()
+            housekeeping.stop()
             logger().info("worker stopped", executor=self.executor)
 
     def _deliver_until_stopped(self) -> None:

@@ -20,6 +20,7 @@ from specimap_core.atomic import disk_errors, remove
 from specimap_core.errors import NotFoundError, SpecimapError
 from specimap_infra.database import utc_now
 from specimap_infra.errors import JobConflictError
+from specimap_infra.housekeeping import sweep_leftovers
 from specimap_infra.ids import new_id
 from specimap_infra.logs import logger
 from specimap_infra.tables import ROLES, Acquisition, StoredFile, Upload
@@ -255,6 +256,7 @@ class Uploads:
         judging = self.context.settings.scratch / "judging"
         for folder in judging.iterdir() if judging.is_dir() else ():
             _remove_old(folder)
+        sweep_leftovers(self.context.settings, self.context.storage)
         if due:
             logger().info("uploads swept", expired=len(due))
 
