@@ -99,7 +99,7 @@ END
 check_worker() {
     in_image "$1" python -c '
 import cv2, embreex, open3d, pycolmap, scipy, tensorstore, specimap_workers.worker
-print("COLMAP", pycolmap.__version__, "with CUDA" if pycolmap.has_cuda else "without CUDA")'
+print("COLMAP", pycolmap.__version__)'
     starts_and_ends "$1" <<'END'
 import os, sqlite3
 holds = os.path.exists("/data/specimap.db")

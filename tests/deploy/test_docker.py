@@ -60,11 +60,6 @@ def built_from(target: str) -> Iterator[str]:
             yield from built_from(source)
 
 
-def pins(file: Path) -> dict[str, str]:
-    lines = (line.partition(";")[0].strip() for line in file.read_text("utf-8").splitlines())
-    return dict(line.split("==") for line in lines if line and not line.startswith("#"))
-
-
 @pytest.mark.parametrize("target", IMAGES)
 def test_an_image_runs_as_nobody_in_particular(target: str) -> None:
     instructions = lineage(target)
@@ -143,10 +138,11 @@ def test_bases_are_pinned_and_versions_are_the_projects_own() -> None:
                 assert re.fullmatch(r"[a-z/]+:v?\d+\.\d+(\.\d+)?(-\w+)?", image)
 
 
-def test_colmap_with_cuda_is_the_locked_release() -> None:
-    lock, gpu = pins(ROOT / "requirements.lock"), pins(DOCKER / "worker-gpu.lock")
-    assert gpu["pycolmap-cuda12"] == lock["pycolmap"]
-    assert not set(gpu) & set(lock)
+def test_a_worker_with_gpus_is_the_worker_that_sees_them() -> None:
+    base, *own = stages()["worker-gpu"]
+    assert base == ("FROM", "worker-cpu AS worker-gpu")
+    assert {word for word, _ in own} == {"LABEL", "ENV", "CMD"}
+    assert any("NVIDIA_VISIBLE_DEVICES=all" in rest for word, rest in own if word == "ENV")
 
 
 def test_builder_is_sent_what_the_images_copy_and_no_more() -> None:

@@ -140,6 +140,13 @@ def test_a_wrong_value_of_a_backends_variable_is_refused_by_its_name(
     assert error.details["setting"] == name
 
 
+def test_a_gpu_for_the_default_backends_depth_is_refused_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPECIMAP_DENSE_DEVICE", "gpu")
+    error = refused()
+    assert (error.code, error.details["setting"]) == ("setting_invalid", "SPECIMAP_DENSE_DEVICE")
+    assert error.advice.startswith("Remove it: depth is measured on the CPU")
+
+
 def test_a_variable_that_only_looks_like_a_backends_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SPECIMAP_MAST3R_WIEGHTS", "/x")
     assert refused().message == "There is no setting SPECIMAP_MAST3R_WIEGHTS."

@@ -78,7 +78,7 @@ class PipelineSettings:
 
 
 def settings_from(options: RunOptions, device: Device = "auto") -> PipelineSettings:
-    """Settings of a run from what a person chooses and the ``device`` that depth is measured on; checked.
+    """Settings of a run from what a person chooses and the ``device`` that its keys hold; checked.
 
     Raises:
         SettingsError, UnknownDictionaryError: see :meth:`PipelineSettings.check`.

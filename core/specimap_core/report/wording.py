@@ -69,7 +69,7 @@ WARNING_ADVICE = {
     "cube_camera_not_frame": "Nothing: it says how the cube was recorded.",
     "cube_camera_unfit": "Record the cube again at an even speed, and touch nothing between photos and cube.",
     "dense_on_gpu": "Nothing: it says where depth was measured.",
-    "dense_gpu_failed": "Nothing for this result. Have the worker's GPU looked at, or set it to use the CPU.",
+    "dense_gpu_failed": "Nothing: it says where depth was measured.",
     "backend_run": "Nothing: keep it with the result, so that it can be repeated.",
     "depth_unaligned": "Show two or more markers in the photos that are named, or run the default backend.",
     "coverage_low": "Take more photos, also from the side that is missing in the coverage map, sharp and evenly lit.",

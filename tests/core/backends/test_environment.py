@@ -23,7 +23,6 @@ from specimap_core.reconstruct.backend import ReconstructSettings
 from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES, backends_from
 from specimap_core.reconstruct.backends.mast3r import settings as mast3r
 from specimap_core.reconstruct.backends.requirements import check_required
-from specimap_core.reconstruct.dense import patchmatch
 from specimap_core.reconstruct.dense.device import DEVICES, Device, dense_device
 from specimap_core.reconstruct.dense.settings import DepthSettings
 from specimap_core.reconstruct.features import choice
@@ -122,17 +121,22 @@ def test_the_device_comes_from_the_environment(bare: pytest.MonkeyPatch) -> None
     for device in DEVICES:
         bare.setenv("SPECIMAP_DENSE_DEVICE", f" {device} ")
         assert run_with().reconstruct.depth.device == device == backends_from(os.environ).device
-    bare.setenv("SPECIMAP_DENSE_DEVICE", "cuda")
-    with pytest.raises(SettingsError, match="SPECIMAP_DENSE_DEVICE is 'cuda'") as caught:
-        run_with()
-    assert caught.value.details["setting"] == "SPECIMAP_DENSE_DEVICE"
+    for device, advice in (("gpu", "Remove it: depth is measured on the CPU"), ("cuda", "one of: auto, cpu.")):
+        bare.setenv("SPECIMAP_DENSE_DEVICE", device)
+        for read in (run_with, lambda: backends_from(os.environ)):
+            with pytest.raises(SettingsError, match=f"SPECIMAP_DENSE_DEVICE is '{device}'") as caught:
+                read()
+            assert caught.value.code == "setting_invalid"
+            assert caught.value.details["setting"] == "SPECIMAP_DENSE_DEVICE"
+            assert advice in caught.value.advice
 
 
 def test_a_device_that_there_is_not_is_refused() -> None:
-    strange = ReconstructSettings(depth=DepthSettings(device="cuda"))  # type: ignore[arg-type]
-    with pytest.raises(SettingsError, match="no device 'cuda'") as caught:
-        PipelineSettings(reconstruct=strange).check()
-    assert caught.value.advice == "Choose one of: auto, cpu, gpu."
+    for device in ("cuda", "gpu"):
+        strange = ReconstructSettings(depth=DepthSettings(device=device))  # type: ignore[arg-type]
+        with pytest.raises(SettingsError, match=f"no device '{device}'") as caught:
+            PipelineSettings(reconstruct=strange).check()
+        assert caught.value.advice == "Choose one of: auto, cpu."
 
 
 # ---- what they change ---------------------------------------------------------------------------------
@@ -142,6 +146,7 @@ def test_the_default_backends_keys_know_nothing_of_other_backends(tmp_path: Path
     settings = run_with()
     keys = keys_of(settings)
     chosen = settings.as_dict()
+    assert chosen["reconstruct"]["depth"]["device"] == "auto", "a part of the keys of earlier versions"  # type: ignore[index]
     parts = {"photos": PHOTOS, "acquisition": chosen["acquisition"], "s": chosen["reconstruct"]}
     assert keys["reconstruct"] == key_of("reconstruct", parts)
     bring_mast3r(tmp_path, bare)
@@ -240,15 +245,6 @@ def test_features_that_are_not_installed_are_refused_where_the_backend_takes_the
     for backend in ("colmap", "da3"):
         assert "ALIKED needs kornia" in refused(backend=backend, features="aliked").message
     assert "checkout" in refused(backend="mast3r", features="aliked").message
-
-
-def test_a_gpu_that_cannot_be_used_is_refused_where_it_is_asked_for(bare: pytest.MonkeyPatch) -> None:
-    on_gpu = DepthSettings(device="gpu")
-    bare.setattr(patchmatch, "what_is_missing", lambda: "No CUDA device is in sight.")
-    assert refused(depth=on_gpu).message.endswith("on a GPU. No CUDA device is in sight.")
-    require(ReconstructSettings())
-    bare.setattr(patchmatch, "what_is_missing", lambda: None)
-    require(ReconstructSettings(depth=on_gpu))
 
 
 def test_a_network_is_refused_for_what_it_lacks_first(tmp_path: Path, bare: pytest.MonkeyPatch) -> None:

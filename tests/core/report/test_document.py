@@ -118,13 +118,21 @@ def test_hostile_names_are_text(tmp_path: Path) -> None:
 
 
 def test_a_report_of_an_older_version(tmp_path: Path) -> None:
-    old = folder_of(tmp_path / "out", old=True)
+    points = scene(70, 53)
+    on_gpu = {
+        "warnings": [Notice("dense_on_gpu", "By COLMAP's PatchMatch."), Notice("dense_gpu_failed", "Out of memory.")],
+        "settings": {"reconstruct": {"depth": {"device": "gpu"}}},
+    }
+    old = folder_of(tmp_path / "out", full_report(len(points)).model_copy(update=on_gpu), points, old=True)
     (old / "preview.png").unlink()
     assert "photo_corners" not in json.loads((old / "report.json").read_text(encoding="utf-8"))
     page = page_of(old)
     assert "did not keep the corners in the photos" in page.said
     assert "a.jpg, b.jpg, c.jpg" in page.said
     assert len(page.images) == 7
+    assert "By COLMAP's PatchMatch." in page.said
+    assert "Out of memory." in page.said
+    assert page.row("reconstruct.depth.device") == ["reconstruct.depth.device", "gpu"]
 
 
 @pytest.mark.slow

@@ -1,5 +1,5 @@
-"""The ``colmap`` backend: poses from markers, features where markers do not reach, dense depth on
-the CPU, or by COLMAP on a GPU."""
+"""The ``colmap`` backend: poses from markers, features where markers do not reach, dense depth
+from rectified pairs on the CPU."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from specimap_core.reconstruct.backend import (
     ReconstructSettings,
     sparse_points,
 )
-from specimap_core.reconstruct.dense.patchmatch import measure_depth
+from specimap_core.reconstruct.dense.multi_view import dense_depth
 from specimap_core.reconstruct.dense.volume import volume_over
 from specimap_core.reconstruct.poses import pose_photos
 
@@ -33,7 +33,7 @@ class ColmapBackend:
         """See :class:`specimap_core.reconstruct.backend.ReconstructionBackend`."""
         posed = pose_photos(photos, corners, settings, workers=workers, progress=lambda share: progress(0.15 * share))
         progress(0.15)
-        maps, warnings = measure_depth(
+        maps = dense_depth(
             [photos[p].image for p in posed.photos],
             posed.lens,
             posed.poses,
@@ -49,5 +49,5 @@ class ColmapBackend:
             tuple(maps),
             sparse_points(maps, posed.poses),
             posed.refused,
-            (*posed.warnings, *warnings),
+            posed.warnings,
         )

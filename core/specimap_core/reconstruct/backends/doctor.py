@@ -12,12 +12,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from specimap_core.errors import SpecimapError
+from specimap_core.errors import SettingsError, SpecimapError
 from specimap_core.reconstruct.backends.da3 import settings as da3
 from specimap_core.reconstruct.backends.environment import da3_from, mast3r_from
 from specimap_core.reconstruct.backends.mast3r import settings as mast3r
 from specimap_core.reconstruct.backends.probe import cpu_count, driver_gpus, probe
 from specimap_core.reconstruct.backends.weights import Weights
+from specimap_core.reconstruct.dense.device import dense_device
 
 DEFAULT_BACKEND = "colmap"
 COLMAP_MODULES = ("numpy", "scipy", "cv2", "pycolmap", "embreex", "open3d")
@@ -54,13 +55,12 @@ class Usable:
 @dataclass(frozen=True)
 class Machine:
     """``gpus``: as the driver tells, each with name and memory. ``torch_gpus``: those that this program's torch
-    reaches, None where it has no torch. ``pycolmap_cuda``: whether COLMAP was built for GPUs."""
+    reaches, None where it has no torch."""
 
     cpus: int
     memory_bytes: int
     gpus: tuple[dict[str, Any], ...]
     torch_gpus: int | None
-    pycolmap_cuda: bool
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def diagnose(environment: Mapping[str, str]) -> Diagnosis:
     found, torch = colmap.of(own, COLMAP_MODULES), asked.of(own, ALIKED_MODULES)
     sift = colmap.of(own, ("numpy", "pycolmap"))
     parts = (
-        _usable("colmap", "backend", found, _missing(found, _install_pipeline)),
+        _usable("colmap", "backend", found, [*_refused(environment), *_missing(found, _install_pipeline)]),
         *backends,
         _usable("sift", "features", sift, _missing(sift, _install_pipeline)),
         _usable("aliked", "features", torch, _missing(torch, _install_learned)),
@@ -127,9 +127,17 @@ def diagnose(environment: Mapping[str, str]) -> Diagnosis:
         os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
         gpus,
         len(torch["gpus"]) if "gpus" in torch else None,
-        bool(found.get("pycolmap_cuda")),
     )
     return Diagnosis(machine, parts)
+
+
+def _refused(environment: Mapping[str, str]) -> list[Missing]:
+    """The variable that every run is refused for, if it is."""
+    try:
+        dense_device(environment)
+    except SettingsError as error:
+        return [Missing(error.message, error.advice)]
+    return []
 
 
 def _missing(found: dict[str, Any], do: Callable[[list[str]], str]) -> list[Missing]:

@@ -1,4 +1,4 @@
-"""What the environment says of backends and of the device for dense stereo: all its variables, in one place.
+"""What the environment says of backends: all its variables, in one place.
 
 A program reads it once, when it starts, and passes the answer on. Nothing heavy is imported, so that the service can.
 """
@@ -18,7 +18,7 @@ from specimap_core.reconstruct.dense.device import DENSE_DEVICE, Device, dense_d
 BACKEND_VARIABLES: dict[str, str] = {
     **{mast3r.PREFIX + name: meaning for name, meaning in mast3r.VARIABLES.items()},
     **{da3.PREFIX + name: meaning for name, meaning in da3.VARIABLES.items()},
-    DENSE_DEVICE: "Where the default backend measures depth: auto, cpu or gpu; auto takes a GPU where there is one.",
+    DENSE_DEVICE: "Obsolete: auto and cpu give the same result, and gpu is refused. Depth is measured on the CPU.",
 }
 """Variable, and what it is."""
 NOT_IN_IDENTITY = ("cache", "hash_cache", "weights")
@@ -28,7 +28,7 @@ counts."""
 
 @dataclass(frozen=True)
 class BackendSettings:
-    """Settings of the backends with a network, and the ``device`` of the default backend."""
+    """Settings of the backends with a network, and the ``device`` that the default backend's keys hold."""
 
     mast3r: Mast3rSettings = field(default_factory=Mast3rSettings)
     da3: Da3Settings = field(default_factory=Da3Settings)

@@ -43,9 +43,6 @@ if "torch" in found:
         {"name": p.name, "memory_bytes": p.total_memory}
         for p in map(torch.cuda.get_device_properties, range(torch.cuda.device_count()))
     ] if torch.cuda.is_available() else []
-if "pycolmap" in found:
-    import pycolmap
-    facts["pycolmap_cuda"] = bool(pycolmap.has_cuda)
 print("\\n" + json.dumps({"modules": found, **facts}))
 """
 

@@ -6,29 +6,26 @@ import sys
 
 from specimap_core.errors import BackendUnavailableError
 from specimap_core.reconstruct.backend import ReconstructSettings
-from specimap_core.reconstruct.backends.doctor import DEFAULT_BACKEND, install_command
+from specimap_core.reconstruct.backends.doctor import install_command
 from specimap_core.reconstruct.backends.environment import BackendSettings, backend_found
 from specimap_core.reconstruct.backends.mast3r.settings import NAME as MAST3R
 from specimap_core.reconstruct.backends.probe import probe
 
 
 def check_required(settings: ReconstructSettings, backends: BackendSettings) -> None:
-    """Refuse a backend, features or a device that are not to be had here.
+    """Refuse a backend or features that are not to be had here.
 
     Costs nothing for the default backend; for others an interpreter is asked to import what they need: seconds.
 
     Raises:
         BackendUnavailableError: something is missing; message and advice name it.
     """
-    # Both load COLMAP, which stage 1 loads anyway.
-    from specimap_core.reconstruct.dense.patchmatch import check_device
+    # This loads COLMAP, which stage 1 loads anyway.
     from specimap_core.reconstruct.features.choice import check_features
 
     if settings.backend != MAST3R:  # it has no use for features
         check_features(settings.features)
     check_backend(settings.backend, backends)
-    if settings.backend == DEFAULT_BACKEND:
-        check_device(settings.depth)
 
 
 def check_backend(name: str, backends: BackendSettings) -> None:

@@ -17,8 +17,8 @@ class DepthSettings:
     fewer from ``many_photos`` on, since every place is then seen by more photos anyway. ``block_px``: matching
     window. ``matching_share`` and ``most_matching_px``: photos are matched at this share of their size, and no larger;
     the mesh is refined on the photos as they are, after which it is as good as from full-size matching.
-    ``uniqueness``: per cent by which the best match must win. ``device``: where depth is measured; ``auto``
-    is a GPU where one is in sight.
+    ``uniqueness``: per cent by which the best match must win. ``device``: no choice any more, but
+    a part of the keys of artefacts, see :mod:`specimap_core.reconstruct.dense.device`.
     """
 
     angle_deg: tuple[float, float, float] = (4.0, 14.0, 30.0)
