@@ -24,9 +24,11 @@ from specimap_service.clouds import export_routes, label_routes, preview_routes,
 from specimap_service.clouds import routes as cloud_routes
 from specimap_service.clouds.spectra import SpectraRequest
 from specimap_service.context import CONTEXT, AppContext
+from specimap_service.contract.description import describe
 from specimap_service.head_requests import HeadRequests
 from specimap_service.jobs import dependencies as jobs
 from specimap_service.jobs import routes as job_routes
+from specimap_service.jobs.schemas import EVENT_TYPES
 from specimap_service.middleware import RequestObserver
 from specimap_service.query_parameters import check_query
 from specimap_service.uploads import dependencies as uploads
@@ -84,6 +86,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         description=DESCRIPTION,
         license_info={"name": "Apache-2.0", "identifier": "Apache-2.0"},
         responses=problems.RESPONSES,
+        servers=[{"url": "/", "description": "The service that this document comes from."}],
         dependencies=[Depends(check_query)],
         redirect_slashes=False,
         lifespan=lifespan,
@@ -93,7 +96,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     for feature in FEATURES:
         feature.open(app, context)
     problems.add_handlers(app)
-    problems.describe(app, extra_models=[SpectraRequest])
+    describe(app, extra_models=[SpectraRequest, *EVENT_TYPES.values()])
     for routes in ROUTES:
         app.include_router(routes.router)
     # The last one added sees a request first: the limits come after CORS and the corrections of uploads, and before

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import datetime
-from typing import Annotated, Generic, TypeVar
+from typing import Annotated, Any, Generic, TypeVar
 
 from fastapi import Query
 from pydantic import AfterValidator, AwareDatetime, BaseModel, Field
@@ -37,6 +37,12 @@ InProject = Annotated[
 
 class Page(BaseModel, Generic[Item]):
     """One page."""
+
+    @classmethod
+    def model_parametrized_name(cls, params: tuple[type[Any], ...]) -> str:
+        """Name the page after its items, as the API's description shows them."""
+        config: dict[str, Any] = getattr(params[0], "model_config", {})
+        return f"{config.get('title', params[0].__name__)}Page"
 
     items: list[Item]
     next: str | None = Field(description="Give it as `after` for the next page; null on the last one.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import PurePosixPath
+from typing import Any
 
 import sqlalchemy as sa
 from fastapi import APIRouter, Request, Response
@@ -22,9 +23,13 @@ from specimap_service.byte_ranges import ranged_response
 from specimap_service.context import Context, audit
 
 router = APIRouter(prefix="/v1", tags=["files"])
+BYTES: dict[str, Any] = {
+    "description": "The file's bytes, or the range that was requested",
+    "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+}
 
 
-@router.get("/acquisitions/{acquisition_id}/files")
+@router.get("/acquisitions/{acquisition_id}/files", operation_id="files.list")
 def list_files(context: Context, principal: Reader, acquisition_id: AcquisitionId) -> list[File]:
     """List all files with their judgement, in the order of their arrival."""
     with context.database.session() as session:
@@ -36,7 +41,7 @@ def list_files(context: Context, principal: Reader, acquisition_id: AcquisitionI
         return [File.model_validate(row) for row in rows]
 
 
-@router.get("/acquisitions/{acquisition_id}/files/{file_id}")
+@router.get("/acquisitions/{acquisition_id}/files/{file_id}", operation_id="files.get")
 def get_file(context: Context, principal: Reader, acquisition_id: AcquisitionId, file_id: FileId) -> File:
     """Return one file."""
     with context.database.session() as session:
@@ -46,7 +51,8 @@ def get_file(context: Context, principal: Reader, acquisition_id: AcquisitionId,
 @router.get(
     "/acquisitions/{acquisition_id}/files/{file_id}/content",
     response_class=Response,
-    responses={200: {"content": {"application/octet-stream": {}}}, 206: {"content": {"application/octet-stream": {}}}},
+    responses={200: BYTES, 206: BYTES},
+    operation_id="files.get_content",
 )
 def get_content(
     context: Context, principal: Reader, request: Request, acquisition_id: AcquisitionId, file_id: FileId
@@ -58,7 +64,7 @@ def get_content(
     return ranged_response(request, context.storage, row.storage_key, kind or "application/octet-stream", row.label)
 
 
-@router.delete("/acquisitions/{acquisition_id}/files/{file_id}", status_code=204)
+@router.delete("/acquisitions/{acquisition_id}/files/{file_id}", status_code=204, operation_id="files.delete")
 def delete_file(context: Context, principal: Uploader, acquisition_id: AcquisitionId, file_id: FileId) -> None:
     """Delete a file, to send a better one. Refused while a job works on the acquisition."""
     with context.database.session() as session:

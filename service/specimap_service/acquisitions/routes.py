@@ -75,7 +75,7 @@ class AcquisitionView(BaseModel):
     missing: list[str] = Field(description="What is still needed, a sentence each.")
 
 
-@router.post("/acquisitions", status_code=201)
+@router.post("/acquisitions", status_code=201, operation_id="acquisitions.create")
 def create_acquisition(
     context: Context, principal: Uploader, judge: JudgeDep, wanted: AcquisitionRequest
 ) -> AcquisitionView:
@@ -96,7 +96,7 @@ def create_acquisition(
     return view
 
 
-@router.get("/acquisitions")
+@router.get("/acquisitions", operation_id="acquisitions.list")
 def list_acquisitions(
     context: Context,
     principal: Reader,
@@ -126,7 +126,7 @@ def list_acquisitions(
     return page_of(views, [row.id for row in rows], limit)
 
 
-@router.get("/acquisitions/{acquisition_id}")
+@router.get("/acquisitions/{acquisition_id}", operation_id="acquisitions.get")
 def get_acquisition(context: Context, principal: Reader, acquisition_id: AcquisitionId) -> AcquisitionView:
     """Return one acquisition."""
     with context.database.session() as session:
@@ -136,7 +136,7 @@ def get_acquisition(context: Context, principal: Reader, acquisition_id: Acquisi
         return _view(session, row)
 
 
-@router.delete("/acquisitions/{acquisition_id}", status_code=204)
+@router.delete("/acquisitions/{acquisition_id}", status_code=204, operation_id="acquisitions.delete")
 def delete_acquisition(
     context: Context,
     principal: Admin,

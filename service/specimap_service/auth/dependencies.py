@@ -105,6 +105,10 @@ async def known_principal(
 Known = Annotated[Principal, Depends(known_principal)]
 
 
+SCOPE_OF: dict[Callable[..., object], str] = {}
+"""The scope that each dependency made by :func:`requires` asks for, from which the API's description takes it."""
+
+
 def requires(scope: str) -> Callable[..., Awaitable[Principal]]:
     """Make a dependency: the request's principal, if its key has the scope. ``admin`` has all."""
 
@@ -113,6 +117,7 @@ def requires(scope: str) -> Callable[..., Awaitable[Principal]]:
             raise ForbiddenError(f"The key lacks the scope {scope!r}.", advice="Use a key that has it.", scope=scope)
         return found
 
+    SCOPE_OF[principal] = scope
     return principal
 
 

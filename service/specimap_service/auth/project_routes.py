@@ -39,7 +39,7 @@ class Project(BaseModel):
     created_at: datetime.datetime
 
 
-@router.post("/projects", status_code=201)
+@router.post("/projects", status_code=201, operation_id="projects.create")
 def create_project(context: Context, principal: Admin, wanted: ProjectRequest) -> Project:
     """Create a project; then create its keys."""
     with context.database.session() as session:
@@ -48,7 +48,7 @@ def create_project(context: Context, principal: Admin, wanted: ProjectRequest) -
     return Project.model_validate(row)
 
 
-@router.get("/projects")
+@router.get("/projects", operation_id="projects.list")
 def list_projects(context: Context, principal: Reader) -> list[Project]:
     """List the projects that the key sees: its own, for an administrator all."""
     with context.database.session() as session:
@@ -56,14 +56,14 @@ def list_projects(context: Context, principal: Reader) -> list[Project]:
         return [Project.model_validate(row) for row in session.scalars(query)]
 
 
-@router.get("/projects/{project_id}")
+@router.get("/projects/{project_id}", operation_id="projects.get")
 def get_project(context: Context, principal: Reader, project_id: ProjectId) -> Project:
     """Return one project."""
     with context.database.session() as session:
         return Project.model_validate(load(session, principal, ProjectRow, project_id))
 
 
-@router.patch("/projects/{project_id}")
+@router.patch("/projects/{project_id}", operation_id="projects.update")
 def change_project(context: Context, principal: Admin, project_id: ProjectId, wanted: ProjectRequest) -> Project:
     """Rename a project. Its id, its keys and its objects stay as they are."""
     with context.database.session() as session:

@@ -69,7 +69,7 @@ class NewKey(Key):
 class Audited(BaseModel):
     """An entry of the audit trail: which key did what to which object."""
 
-    model_config = ConfigDict(from_attributes=True)
+    model_config = ConfigDict(title="AuditEntry", from_attributes=True)
 
     id: int
     at: datetime.datetime
@@ -81,7 +81,7 @@ class Audited(BaseModel):
     correlation_id: str
 
 
-@router.post("/keys", status_code=201)
+@router.post("/keys", status_code=201, operation_id="keys.create")
 def create_key(context: Context, principal: Admin, wanted: KeyRequest) -> NewKey:
     """Create a key."""
     if wanted.expires_at is not None and wanted.expires_at <= utc_now():
@@ -105,7 +105,7 @@ def create_key(context: Context, principal: Admin, wanted: KeyRequest) -> NewKey
     return NewKey(**Key.model_validate(row).model_dump(), key=key)
 
 
-@router.get("/keys")
+@router.get("/keys", operation_id="keys.list")
 def list_keys(context: Context, principal: Admin, project: InProject = None) -> list[Key]:
     """List all keys, revoked ones too."""
     query = sa.select(ApiKey).where(in_sight(principal, ApiKey, project)).order_by(ApiKey.id)
@@ -113,7 +113,7 @@ def list_keys(context: Context, principal: Admin, project: InProject = None) -> 
         return [Key.model_validate(row) for row in session.scalars(query)]
 
 
-@router.delete("/keys/{key_id}", status_code=204)
+@router.delete("/keys/{key_id}", status_code=204, operation_id="keys.revoke")
 def revoke_key(context: Context, principal: Admin, keyring: KeyringDep, key_id: KeyId) -> None:
     """Revoke a key; it is refused within two seconds everywhere."""
     with context.database.session() as session:
@@ -123,7 +123,7 @@ def revoke_key(context: Context, principal: Admin, keyring: KeyringDep, key_id: 
     keyring.forget()
 
 
-@router.get("/audit")
+@router.get("/audit", operation_id="audit.list")
 def list_audit(
     context: Context,
     principal: Admin,

@@ -44,6 +44,7 @@ class Export(BaseModel):
     "/{format}",
     status_code=202,
     responses={200: {"model": Export, "description": "The file exists already."}},
+    operation_id="exports.create",
 )
 def create_export(
     context: Context, principal: Reader, clouds: CloudsDep, response: Response, cloud_id: CloudId, format: FileFormat
@@ -94,7 +95,7 @@ def create_export(
     return _view(row)
 
 
-@router.get("")
+@router.get("", operation_id="exports.list")
 def list_exports(context: Context, principal: Reader, clouds: CloudsDep, cloud_id: CloudId) -> list[Export]:
     """List the files that exist or are being made; `mesh-ply` always exists."""
     cloud = clouds.record(cloud_id)
@@ -104,7 +105,7 @@ def list_exports(context: Context, principal: Reader, clouds: CloudsDep, cloud_i
     return [*map(_view, rows), _mesh_ply(context, cloud)]
 
 
-@router.get("/{format}")
+@router.get("/{format}", operation_id="exports.get")
 def get_export(context: Context, principal: Reader, clouds: CloudsDep, cloud_id: CloudId, format: FileFormat) -> Export:
     """Return the state of a file."""
     cloud = clouds.record(cloud_id)
@@ -126,8 +127,8 @@ FILE: dict[int | str, dict[str, Any]] = {
 }
 
 
-@router.head("/{format}/content", response_class=Response, responses=FILE, operation_id="head_export_content")
-@router.get("/{format}/content", response_class=Response, responses=FILE)
+@router.head("/{format}/content", response_class=Response, responses=FILE, operation_id="exports.head_content")
+@router.get("/{format}/content", response_class=Response, responses=FILE, operation_id="exports.get_content")
 def get_content(
     context: Context, principal: Reader, clouds: CloudsDep, request: Request, cloud_id: CloudId, format: FileFormat
 ) -> Response:

@@ -97,6 +97,7 @@ BINARY = {"schema": {"type": "string", "format": "binary"}}
     status_code=201,
     responses={200: {"model": Label, "description": "The current version is the same; nothing was changed."}},
     openapi_extra={"requestBody": {"required": True, "content": {ARROW: BINARY, NPY: BINARY}}},
+    operation_id="labels.put",
 )
 async def put(
     context: Context,
@@ -172,7 +173,7 @@ def _append(target: FilePath, data: bytes) -> None:
         file.write(data)
 
 
-@router.get("/clouds/{cloud_id}/labels")
+@router.get("/clouds/{cloud_id}/labels", operation_id="labels.list")
 def list_labels(context: Context, principal: Reader, clouds: CloudsDep, cloud_id: CloudId) -> list[Label]:
     """List the current version of each layer, by name."""
     clouds.record(cloud_id)
@@ -180,7 +181,7 @@ def list_labels(context: Context, principal: Reader, clouds: CloudsDep, cloud_id
         return [_view(row) for row in current_labels(session, cloud_id)]
 
 
-@router.get("/clouds/{cloud_id}/labels/{name}")
+@router.get("/clouds/{cloud_id}/labels/{name}", operation_id="labels.get")
 def get_label(
     context: Context,
     principal: Reader,
@@ -196,7 +197,7 @@ def get_label(
     return _view(row)
 
 
-@router.get("/clouds/{cloud_id}/labels/{name}/versions")
+@router.get("/clouds/{cloud_id}/labels/{name}/versions", operation_id="labels.list_versions")
 def list_versions(
     context: Context, principal: Reader, clouds: CloudsDep, cloud_id: CloudId, name: LabelName
 ) -> list[Label]:
@@ -210,7 +211,12 @@ def list_versions(
     return [_view(row) for row in rows]
 
 
-@router.get("/clouds/{cloud_id}/labels/{name}/values", response_model=None, responses=documented_responses(LabelValues))
+@router.get(
+    "/clouds/{cloud_id}/labels/{name}/values",
+    response_model=None,
+    responses=documented_responses(LabelValues),
+    operation_id="labels.get_values",
+)
 def get_values(
     context: Context,
     principal: Reader,
@@ -264,7 +270,7 @@ def _npy(array: PointArray, headers: dict[str, str]) -> Response:
     return StreamingResponse(pieces(), headers={**headers, "Content-Length": str(length)}, media_type=NPY)
 
 
-@router.delete("/clouds/{cloud_id}/labels/{name}", status_code=204)
+@router.delete("/clouds/{cloud_id}/labels/{name}", status_code=204, operation_id="labels.delete")
 def delete(
     context: Context,
     principal: Labeller,

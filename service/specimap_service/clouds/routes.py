@@ -39,6 +39,8 @@ class CloudSummary(BaseModel):
 class CloudAnswer(CloudSummary):
     """A finished cloud with the metadata of its arrays, and links to everything else."""
 
+    model_config = ConfigDict(title="Cloud")
+
     quantity: str = Field(description="Quantity of decoded spectra: `reflectance`, or `counts`.")
     wavelength_nm: list[float | None] = Field(description="One for each band; null where unknown.")
     bad_bands: list[int] = Field(description="Bands that are useless according to the cube's file or its noise.")
@@ -48,7 +50,7 @@ class CloudAnswer(CloudSummary):
     links: dict[str, str]
 
 
-@router.get("/clouds")
+@router.get("/clouds", operation_id="clouds.list")
 def list_clouds(
     context: Context,
     principal: Reader,
@@ -74,7 +76,7 @@ def list_clouds(
     return page_of([CloudSummary.model_validate(row) for row in rows], [row.id for row in rows], limit)
 
 
-@router.get("/clouds/{cloud_id}")
+@router.get("/clouds/{cloud_id}", operation_id="clouds.get")
 def show_cloud(principal: Reader, clouds: CloudsDep, cloud_id: CloudId) -> CloudAnswer:
     """Return one cloud."""
     with clouds.reading(cloud_id) as (record, cloud):
@@ -101,7 +103,10 @@ def show_cloud(principal: Reader, clouds: CloudsDep, cloud_id: CloudId) -> Cloud
 
 
 @router.get(
-    "/clouds/{cloud_id}/corners", response_class=Response, responses={200: {"content": {"application/json": {}}}}
+    "/clouds/{cloud_id}/corners",
+    response_class=Response,
+    responses={200: {"content": {"application/json": {}}}},
+    operation_id="clouds.get_corners",
 )
 def get_corners(
     context: Context, principal: Reader, clouds: CloudsDep, request: Request, cloud_id: CloudId

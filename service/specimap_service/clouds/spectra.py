@@ -165,6 +165,8 @@ class SpectraRequest(_Strict):
 class SpectraAnswer(BaseModel):
     """One page of a selection. ``indices``, ``spectra`` and ``fields`` have one entry for each point."""
 
+    model_config = ConfigDict(title="Spectra")
+
     total: int = Field(description="Points of the whole selection.")
     offset: int
     next_offset: int | None = Field(description="`offset` of the next page; null on the last one.")
@@ -196,6 +198,8 @@ class Point(BaseModel):
 
 class BandAnswer(BaseModel):
     """One band of all points, in their order."""
+
+    model_config = ConfigDict(title="Band")
 
     band: int
     wavelength_nm: float | None

@@ -44,7 +44,7 @@ REPEATED: dict[int | str, dict[str, Any]] = {
 }
 
 
-@router.post("/jobs", status_code=202, responses=REPEATED)
+@router.post("/jobs", status_code=202, responses=REPEATED, operation_id="jobs.create")
 def create_job(
     context: Context,
     principal: Uploader,
@@ -56,7 +56,7 @@ def create_job(
     return _answer(response, *new_job(context, principal, wanted, idempotency_key))
 
 
-@router.post("/jobs/{job_id}/rerun", status_code=202, responses=REPEATED)
+@router.post("/jobs/{job_id}/rerun", status_code=202, responses=REPEATED, operation_id="jobs.rerun")
 def rerun_job(
     context: Context,
     principal: Uploader,
@@ -75,7 +75,7 @@ def _answer(response: Response, job: JobView, made: bool) -> JobView:
     return job
 
 
-@router.get("/jobs")
+@router.get("/jobs", operation_id="jobs.list")
 def list_jobs(
     context: Context,
     principal: Reader,
@@ -104,14 +104,14 @@ def list_jobs(
     return page_of(jobs, [job.id for job in jobs], limit)
 
 
-@router.get("/jobs/{job_id}")
+@router.get("/jobs/{job_id}", operation_id="jobs.get")
 def get_job(context: Context, principal: Reader, job_id: JobId) -> JobView:
     """Return a job as it is now."""
     with context.database.session() as session:
         return job_views(session, [found_job(session, job_id)])[0]
 
 
-@router.post("/jobs/{job_id}/cancel", status_code=202)
+@router.post("/jobs/{job_id}/cancel", status_code=202, operation_id="jobs.cancel")
 def cancel_job(context: Context, principal: Uploader, job_id: JobId) -> JobView:
     """Cancel a job that waits or runs; results of its finished stages are kept for a rerun."""
     with context.database.session() as session:
@@ -124,13 +124,13 @@ def cancel_job(context: Context, principal: Uploader, job_id: JobId) -> JobView:
     return view
 
 
-@router.delete("/jobs/{job_id}", status_code=204)
+@router.delete("/jobs/{job_id}", status_code=204, operation_id="jobs.delete")
 def remove_job(context: Context, principal: Admin, clouds: CloudsDep, job_id: JobId) -> None:
     """Delete a job that has ended, with its result."""
     delete_job(context, clouds, principal.key_id, job_id)
 
 
-@router.get("/jobs/{job_id}/report")
+@router.get("/jobs/{job_id}/report", operation_id="jobs.get_report")
 def get_report(context: Context, principal: Reader, job_id: JobId) -> Report:
     """Return the report on the job's result."""
     with context.database.session() as session:
@@ -147,7 +147,7 @@ def get_report(context: Context, principal: Reader, job_id: JobId) -> Report:
     return Report.model_validate(report)
 
 
-@router.get("/jobs/{job_id}/log")
+@router.get("/jobs/{job_id}/log", operation_id="jobs.get_log")
 def get_log(
     context: Context, principal: Reader, job_id: JobId, after: AfterSeq = None, limit: Limit = 100
 ) -> Page[LogLine]:
@@ -174,6 +174,7 @@ def get_log(
         200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}, "description": "Events as they occur"},
         204: {"description": "The job has ended and there is no event after the last one seen: do not reconnect"},
     },
+    operation_id="jobs.follow_events",
 )
 async def follow_events(
     context: Context,

@@ -10,7 +10,8 @@ from fastapi import Header, Query
 from pydantic import BaseModel, ConfigDict, Field
 
 from specimap_core.json_text import json_text
-from specimap_infra.job_schemas import JobSettings, PriorityName
+from specimap_infra.job_schemas import JobFailure, JobSettings, JobState, PriorityName
+from specimap_infra.jobs import Level, Stage
 
 AfterJob = Annotated[str | None, Query(pattern=r"^job_[0-9a-z]{26}$", description="`next` of the page before.")]
 AfterSeq = Annotated[int | None, Query(ge=0, lt=2**31, description="Only events after the one of this number.")]
@@ -95,3 +96,46 @@ class LogLine(BaseModel):
     level: str
     message: str
     data: dict[str, Any]
+
+
+# ---- events -------------------------------------------------------------------------------------------
+
+
+class JobStateEvent(BaseModel):
+    """The job has another state; after a final one there is no event."""
+
+    model_config = ConfigDict(json_schema_extra={"example": {"state": "running", "starts": 1}})
+
+    state: JobState
+    starts: int | None = Field(None, description="How often a worker took it up; left out in a final state.")
+    error: JobFailure | None = Field(None, description="In a final state: why it failed.")
+    cloud_id: str | None = Field(None, description="In a final state: the result, if it succeeded.")
+
+
+class JobProgressEvent(BaseModel):
+    """The stage that runs has come further."""
+
+    model_config = ConfigDict(json_schema_extra={"example": {"stage": "reconstruct", "progress": 0.25}})
+
+    stage: Stage
+    progress: float = Field(ge=0, le=1, description="Share of the stage that is done.")
+
+
+class JobLogEvent(BaseModel):
+    """A line was added to the log."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"example": {"level": "info", "message": "24 photos are used.", "data": {}}}
+    )
+
+    level: Level
+    message: str
+    data: dict[str, Any]
+
+
+EVENT_TYPES: dict[str, type[BaseModel]] = {
+    "state": JobStateEvent,
+    "progress": JobProgressEvent,
+    "log": JobLogEvent,
+}
+"""What each type of event holds, by its name in the stream."""

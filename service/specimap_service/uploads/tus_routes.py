@@ -150,32 +150,47 @@ _BODY: dict[str, Any] = {
 }
 DOCUMENTED: dict[str, dict[str, Any]] = {
     "POST": {
+        "id": "uploads.create",
         "summary": "Create an upload",
         "description": "`Upload-Metadata`: `acquisition` (its id), `role` (photo, cube, white, dark), `filename`, each "
         "with its value in base64. The answer's `Location` takes the bytes. The body is empty.",
         "headers": ("Location", "Upload-Expires"),
     },
     "HEAD": {
+        "id": "uploads.get_offset",
         "summary": "Ask how much has arrived",
         "description": "`Upload-Offset` says where to continue.",
         "headers": ("Upload-Offset", "Upload-Length", "Upload-Metadata"),
     },
     "PATCH": {
+        "id": "uploads.append",
         "summary": "Send bytes",
         "description": "From `Upload-Offset` on; with `Upload-Checksum` (sha1, sha256 or md5, and the digest in "
         "base64) all or nothing: 460 where it differs. The answer to the last byte comes when the file has been "
         "judged, and carries `Specimap-File` and `Specimap-Verdict`; `GET …/result` says more.",
         "headers": ("Upload-Offset", "Upload-Expires", "Specimap-File", "Specimap-Verdict"),
     },
-    "DELETE": {"summary": "End an upload", "description": "Its bytes are removed.", "headers": ()},
+    "DELETE": {
+        "id": "uploads.delete",
+        "summary": "End an upload",
+        "description": "Its bytes are removed.",
+        "headers": (),
+    },
 }
+
+
+NOT_SERVED: dict[str, tuple[str, ...]] = {
+    "POST": ("upload-concat", "upload-defer-length"),
+    "PATCH": ("upload-length", "post_request"),
+}
+"""Parameters of the library's routes, by method, that belong to extensions which are not served."""
 
 
 def _document(route: APIRoute) -> None:
     method = next(iter(route.methods or ()))
     about = DOCUMENTED[method]
     status = str(route.status_code)
-    route.summary, route.description = about["summary"], about["description"]
+    route.operation_id, route.summary, route.description = about["id"], about["summary"], about["description"]
     route.response_class = Response
     # POST to an address that ends in a slash, as some clients do, is the same.
     route.include_in_schema = not route.path.endswith("/")
