@@ -39,10 +39,9 @@ class Page(BaseModel, Generic[Item]):
     """One page."""
 
     @classmethod
-    def model_parametrized_name(cls, params: tuple[type[Any], ...]) -> str:
+    def model_parametrized_name(cls, params: tuple[Any, ...]) -> str:
         """Name the page after its items, as the API's description shows them."""
-        config: dict[str, Any] = getattr(params[0], "model_config", {})
-        return f"{config.get('title', params[0].__name__)}Page"
+        return f"{params[0].model_config.get('title', params[0].__name__)}Page"
 
     items: list[Item]
     next: str | None = Field(description="Give it as `after` for the next page; null on the last one.")

@@ -6,7 +6,7 @@ import datetime
 from typing import Annotated, cast, get_args
 
 import sqlalchemy as sa
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, Query, Response
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, StringConstraints
 from sqlalchemy.orm import Session
 
@@ -20,11 +20,12 @@ from specimap_infra.tables import FINAL_STATES, Acquisition, Job, StoredFile, Up
 from specimap_service.acquisitions.capacity import locked_acquisition
 from specimap_service.acquisitions.dependencies import JudgeDep, UnfinishedUploadsDep
 from specimap_service.acquisitions.schemas import FileCounts, counts
-from specimap_service.auth.access import in_sight, not_found
+from specimap_service.auth.access import in_sight, load, not_found
 from specimap_service.auth.dependencies import Admin, Reader, Uploader
 from specimap_service.auth.object_ids import AcquisitionId
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import Context, audit
+from specimap_service.idempotency import IdempotencyKey, Repeatable, repeated
 from specimap_service.jobs.deletion import JobFiles
 from specimap_service.paging import After, InProject, Limit, Moment, Page, page_of
 
@@ -75,24 +76,37 @@ class AcquisitionView(BaseModel):
     missing: list[str] = Field(description="What is still needed, a sentence each.")
 
 
-@router.post("/acquisitions", status_code=201, operation_id="acquisitions.create")
+@router.post("/acquisitions", status_code=201, responses=repeated(AcquisitionView), operation_id="acquisitions.create")
 def create_acquisition(
-    context: Context, principal: Uploader, judge: JudgeDep, wanted: AcquisitionRequest
+    context: Context,
+    principal: Uploader,
+    judge: JudgeDep,
+    response: Response,
+    wanted: AcquisitionRequest,
+    idempotency_key: IdempotencyKey = None,
 ) -> AcquisitionView:
     """Create an acquisition; then upload its photos and its cube."""
-    row = Acquisition(
-        id=new_id("acq"),
-        project_id=principal.project_id,
-        created_by=principal.key_id,
-        created_at=utc_now(),
-        **wanted.model_dump(),
-    )
-    with context.database.session() as session:
+
+    def make(session: Session, _: str) -> tuple[str, AcquisitionView]:
+        row = Acquisition(
+            id=new_id("acq"),
+            project_id=principal.project_id,
+            created_by=principal.key_id,
+            created_at=utc_now(),
+            **wanted.model_dump(),
+        )
         session.add(row)
         audit(session, principal.key_id, "acquisition.create", row.id)
         session.flush()
-        view = _view(session, row)
+        return row.id, _view(session, row)
+
+    def again(session: Session, acquisition_id: str, _: str) -> AcquisitionView:
+        return _view(session, load(session, principal, Acquisition, acquisition_id))
+
+    request = Repeatable.of(principal, idempotency_key, "acquisitions.create", wanted.model_dump(mode="json"))
+    view, new = request.once(context.database, make, again)
     judge.warm()
+    response.status_code = 201 if new else 200
     return view
 
 

@@ -48,7 +48,7 @@ async def authenticated(request: Request) -> Principal:
         DatabaseUnavailableError: keys cannot be looked up.
     """
     keyring, limiter = KEYRING.of(request.app), LIMITER.of(request.app)
-    key = _key_of(request)
+    key = key_of(request)
     try:
         found = keyring.trusted(key)
         if found is None:
@@ -63,7 +63,8 @@ async def authenticated(request: Request) -> Principal:
     return found
 
 
-def _key_of(request: Request) -> str:
+def key_of(request: Request) -> str:
+    """Return the key that a request presents. Raises UnauthorizedError where there is none."""
     kind, _, key = request.headers.get("authorization", "").partition(" ")
     if kind.lower() != "bearer" or not key.strip():
         raise UnauthorizedError("There is no key.", advice="Send it as `Authorization: Bearer <key>`.")
@@ -73,7 +74,7 @@ def _key_of(request: Request) -> str:
 def trust_of(request: Request) -> Callable[[], Awaitable[float | None]]:
     """Make a check for answers that last: the seconds for which the request's key is trusted, None where it no longer
     is. A key that cannot be looked up keeps its trust."""
-    keyring, key = KEYRING.of(request.app), _key_of(request)
+    keyring, key = KEYRING.of(request.app), key_of(request)
 
     async def seconds() -> float | None:
         left = keyring.trusted_seconds(key)

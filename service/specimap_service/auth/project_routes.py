@@ -6,8 +6,9 @@ import datetime
 from typing import Annotated
 
 import sqlalchemy as sa
-from fastapi import APIRouter
+from fastapi import APIRouter, Response
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from sqlalchemy.orm import Session
 
 from specimap_infra.projects import new_project, rename_project
 from specimap_infra.tables import Project as ProjectRow
@@ -15,6 +16,7 @@ from specimap_service.auth.access import in_sight, load
 from specimap_service.auth.dependencies import Admin, Reader
 from specimap_service.auth.object_ids import ProjectId
 from specimap_service.context import Context, audit
+from specimap_service.idempotency import IdempotencyKey, Repeatable, repeated
 
 router = APIRouter(prefix="/v1", tags=["projects"])
 
@@ -39,13 +41,28 @@ class Project(BaseModel):
     created_at: datetime.datetime
 
 
-@router.post("/projects", status_code=201, operation_id="projects.create")
-def create_project(context: Context, principal: Admin, wanted: ProjectRequest) -> Project:
+@router.post("/projects", status_code=201, responses=repeated(Project), operation_id="projects.create")
+def create_project(
+    context: Context,
+    principal: Admin,
+    response: Response,
+    wanted: ProjectRequest,
+    idempotency_key: IdempotencyKey = None,
+) -> Project:
     """Create a project; then create its keys."""
-    with context.database.session() as session:
+
+    def make(session: Session, _: str) -> tuple[str, Project]:
         row = new_project(session, wanted.name)
         audit(session, principal.key_id, "project.create", row.id)
-    return Project.model_validate(row)
+        return row.id, Project.model_validate(row)
+
+    def again(session: Session, project_id: str, _: str) -> Project:
+        return Project.model_validate(load(session, principal, ProjectRow, project_id))
+
+    request = Repeatable.of(principal, idempotency_key, "projects.create", wanted.model_dump(mode="json"))
+    project, new = request.once(context.database, make, again)
+    response.status_code = 201 if new else 200
+    return project
 
 
 @router.get("/projects", operation_id="projects.list")

@@ -6,18 +6,20 @@ import datetime
 from typing import Annotated, Any, Literal
 
 import sqlalchemy as sa
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
+from sqlalchemy.orm import Session
 
 from specimap_infra.database import utc_now
 from specimap_infra.projects import found_project
 from specimap_infra.tables import ApiKey, AuditEntry
 from specimap_service.auth.access import in_sight, load
-from specimap_service.auth.dependencies import Admin, KeyringDep
-from specimap_service.auth.keys import new_key
+from specimap_service.auth.dependencies import Admin, KeyringDep, key_of
+from specimap_service.auth.keys import derived_secret, key_text, new_key
 from specimap_service.auth.object_ids import KeyId
 from specimap_service.context import Context, audit
 from specimap_service.errors import RequestInvalidError
+from specimap_service.idempotency import IdempotencyKey, Repeatable, repeated
 from specimap_service.paging import InProject, Limit, Moment, Page, page_of
 
 router = APIRouter(prefix="/v1", tags=["keys"])
@@ -63,7 +65,9 @@ class Key(BaseModel):
 class NewKey(Key):
     """A key that was just created."""
 
-    key: str = Field(description="The key itself; it is shown this once and kept nowhere.")
+    key: str = Field(
+        description="The key itself; it is shown this once, or again for the same Idempotency-Key, and kept nowhere."
+    )
 
 
 class Audited(BaseModel):
@@ -81,8 +85,15 @@ class Audited(BaseModel):
     correlation_id: str
 
 
-@router.post("/keys", status_code=201, operation_id="keys.create")
-def create_key(context: Context, principal: Admin, wanted: KeyRequest) -> NewKey:
+@router.post("/keys", status_code=201, responses=repeated(NewKey), operation_id="keys.create")
+def create_key(
+    context: Context,
+    principal: Admin,
+    request: Request,
+    response: Response,
+    wanted: KeyRequest,
+    idempotency_key: IdempotencyKey = None,
+) -> NewKey:
     """Create a key."""
     if wanted.expires_at is not None and wanted.expires_at <= utc_now():
         raise RequestInvalidError(
@@ -90,7 +101,9 @@ def create_key(context: Context, principal: Admin, wanted: KeyRequest) -> NewKey
             advice="Give a later time, with its zone.",
             fields=[{"where": "body.expires_at", "what": "the time has passed"}],
         )
-    with context.database.session() as session:
+    own = key_of(request)
+
+    def make(session: Session, salt: str) -> tuple[str, NewKey]:
         project_id = principal.project_id if wanted.project is None else found_project(session, wanted.project).id
         row, key = new_key(
             wanted.name,
@@ -99,10 +112,20 @@ def create_key(context: Context, principal: Admin, wanted: KeyRequest) -> NewKey
             expires_at=wanted.expires_at,
             rate_per_minute=wanted.rate_per_minute,
             quota_bytes=wanted.quota_bytes,
+            secret=None if idempotency_key is None else derived_secret(own, salt),
         )
         session.add(row)
         audit(session, principal.key_id, "key.create", row.id, scopes=row.scopes)
-    return NewKey(**Key.model_validate(row).model_dump(), key=key)
+        return row.id, NewKey(**Key.model_validate(row).model_dump(), key=key)
+
+    def again(session: Session, key_id: str, salt: str) -> NewKey:
+        row = load(session, principal, ApiKey, key_id)
+        return NewKey(**Key.model_validate(row).model_dump(), key=key_text(key_id, derived_secret(own, salt)))
+
+    repeatable = Repeatable.of(principal, idempotency_key, "keys.create", wanted.model_dump(mode="json"))
+    key, new = repeatable.once(context.database, make, again)
+    response.status_code = 201 if new else 200
+    return key
 
 
 @router.get("/keys", operation_id="keys.list")

@@ -56,12 +56,11 @@ OWN: dict[str, tuple[Refusal, ...]] = {
     "jobs.create": (
         core.NotFoundError,
         core.SettingsError,
-        service.IdempotencyConflictError,
         service.UploadIncompleteError,
     ),
     "jobs.delete": (infra.JobConflictError, infra.StorageUnavailableError),
     "jobs.get_report": (infra.JobConflictError,),
-    "jobs.rerun": (core.SettingsError, service.IdempotencyConflictError, service.UploadIncompleteError),
+    "jobs.rerun": (core.SettingsError, service.UploadIncompleteError),
     "keys.create": (core.NotFoundError,),
     "labels.delete": (service.PreconditionFailedError, infra.StorageUnavailableError),
     "labels.get_values": _ARRAYS,
@@ -118,6 +117,9 @@ def common(method: str, path: str, operation: dict[str, Any]) -> Iterable[Refusa
         yield infra.DatabaseUnavailableError
     if "{" in path:
         yield core.NotFoundError
+    if any(parameter["name"] == "idempotency-key" for parameter in operation.get("parameters", ())):
+        # What the request made before may have been deleted since.
+        yield from (service.IdempotencyConflictError, core.NotFoundError)
 
 
 class Refusals:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import aclosing
-from typing import Annotated, Any
+from typing import Annotated
 
 import sqlalchemy as sa
 from fastapi import APIRouter, Query, Request, Response
@@ -23,13 +23,13 @@ from specimap_service.auth.dependencies import Admin, Reader, Uploader, trust_of
 from specimap_service.auth.object_ids import JobId
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import AppContext, Context, audit
+from specimap_service.idempotency import IdempotencyKey, repeated
 from specimap_service.jobs.commands import delete_job, found_job, new_job, repeated_job, stop_workflow
 from specimap_service.jobs.dependencies import EventsDep, StreamPlace
 from specimap_service.jobs.events import Event, position
 from specimap_service.jobs.schemas import (
     AfterJob,
     AfterSeq,
-    IdempotencyKey,
     JobRequest,
     LastEventId,
     LogLine,
@@ -39,9 +39,7 @@ from specimap_service.paging import InProject, Limit, Moment, Page, page_of
 
 router = APIRouter(prefix="/v1", tags=["jobs"])
 
-REPEATED: dict[int | str, dict[str, Any]] = {
-    200: {"model": JobView, "description": "Created before by the same request"}
-}
+REPEATED = repeated(JobView)
 
 
 @router.post("/jobs", status_code=202, responses=REPEATED, operation_id="jobs.create")

@@ -3,25 +3,17 @@
 from __future__ import annotations
 
 import datetime
-import hashlib
 from typing import Annotated, Any
 
 from fastapi import Header, Query
 from pydantic import BaseModel, ConfigDict, Field
 
-from specimap_core.json_text import json_text
 from specimap_infra.job_schemas import JobFailure, JobSettings, JobState, PriorityName
 from specimap_infra.jobs import Level, Stage
+from specimap_service.idempotency import digest_of
 
 AfterJob = Annotated[str | None, Query(pattern=r"^job_[0-9a-z]{26}$", description="`next` of the page before.")]
 AfterSeq = Annotated[int | None, Query(ge=0, lt=2**31, description="Only events after the one of this number.")]
-IdempotencyKey = Annotated[
-    str | None,
-    Header(
-        pattern=r"^[\x20-\x7e]{1,128}$",
-        description="A name for this request: sent again with the same name, it returns the job created before.",
-    ),
-]
 LastEventId = Annotated[
     str | None, Header(pattern=r"^\d{0,9}$", description="Number of the last event seen; the stream goes on after it.")
 ]
@@ -81,11 +73,6 @@ class RerunRequest(BaseModel):
     def digest(self, job_id: str) -> str:
         """Return a hash that is the same for the same request."""
         return digest_of({"rerun": job_id, **self.model_dump(mode="json", exclude_unset=True)})
-
-
-def digest_of(request: dict[str, Any]) -> str:
-    """Return the SHA-256 of a request's values."""
-    return hashlib.sha256(json_text(request, sort_keys=True).encode()).hexdigest()
 
 
 class LogLine(BaseModel):

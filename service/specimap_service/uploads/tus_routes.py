@@ -17,6 +17,7 @@ from specimap_infra.tables import Upload
 from specimap_service.auth.dependencies import Uploader
 from specimap_service.context import CONTEXT, Context
 from specimap_service.errors import RequestInvalidError
+from specimap_service.idempotency import IdempotencyKey
 from specimap_service.uploads import tus
 from specimap_service.uploads.dependencies import UPLOADS, UploadsDep
 from specimap_service.uploads.files import UploadFiles
@@ -91,12 +92,12 @@ async def _verify_checksum(uploads: UploadsDep, _: Annotated[None, Depends(_chec
 
 
 def _creation_hook(
-    context: Context, uploads: UploadsDep
+    context: Context, uploads: UploadsDep, idempotency_key: IdempotencyKey = None
 ) -> Callable[[dict[str, str], dict[str, Any]], Awaitable[None]]:
     async def create(metadata: dict[str, str], info: dict[str, Any]) -> None:
         exchange = tus.exchange()
         assert exchange.principal is not None
-        upload = await asyncio.to_thread(uploads.create, exchange.principal, metadata, info["size"])
+        upload = await asyncio.to_thread(uploads.create, exchange.principal, metadata, info["size"], idempotency_key)
         exchange.upload = upload
         exchange.headers["Location"] = f"{context.settings.public_url.rstrip('/')}{tus.PREFIX}/{upload.id}"
         exchange.headers["Upload-Expires"] = tus.http_date(upload)
