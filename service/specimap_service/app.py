@@ -23,9 +23,11 @@ from specimap_service.clouds import dependencies as clouds
 from specimap_service.clouds import export_routes, label_routes, preview_routes, spectra_routes, zarr_routes
 from specimap_service.clouds import routes as cloud_routes
 from specimap_service.clouds.spectra import SpectraRequest
+from specimap_service.compression import Compression
 from specimap_service.context import CONTEXT, AppContext
 from specimap_service.contract.description import describe
 from specimap_service.head_requests import HeadRequests
+from specimap_service.jobs import delivery_routes
 from specimap_service.jobs import dependencies as jobs
 from specimap_service.jobs import routes as job_routes
 from specimap_service.jobs.schemas import EVENT_TYPES
@@ -53,6 +55,7 @@ ROUTES = (
     file_routes,
     upload_routes,
     job_routes,
+    delivery_routes,
     cloud_routes,
     zarr_routes,
     spectra_routes,
@@ -101,6 +104,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         app.include_router(routes.router)
     # The last one added sees a request first: the limits come after CORS and the corrections of uploads, and before
     # everything that reads a body.
+    app.add_middleware(Compression)
     app.add_middleware(HeadRequests)
     app.add_middleware(BodyLimits)
     tus_routes.mount(app)
@@ -122,7 +126,10 @@ EXPOSED = [
     "Content-Length",
     "Content-Range",
     "ETag",
+    "Link",
     "Location",
+    "RateLimit",
+    "RateLimit-Policy",
     "Retry-After",
     "X-Correlation-Id",
     "Tus-Resumable",

@@ -12,12 +12,13 @@ import httpx
 import pytest
 import sqlalchemy as sa
 
+from specimap_infra import jobs
 from specimap_infra.database import utc_now
-from specimap_infra.tables import Acquisition, ApiKey, Export, Job, Project, RepeatableRequest, Upload
+from specimap_infra.tables import Acquisition, ApiKey, Delivery, Export, Job, Project, RepeatableRequest, Upload
 from specimap_service.contract.description import operations
 from specimap_service.idempotency import KEPT, sweep
 from specimap_service.openapi import document
-from tests.support.job_scene import acquisition
+from tests.support.job_scene import acquisition, queued_job
 from tests.support.result_scene import put_result
 from tests.support.service_scene import Running, serving
 from tests.support.upload_scene import TUS, metadata, new_acquisition
@@ -27,7 +28,7 @@ HEADER = {"Idempotency-Key": "case 17"}
 
 @pytest.fixture
 def any_service(any_database: str, tmp_path: Path) -> Iterator[Running]:
-    with serving(tmp_path / "service", database_url=any_database) as running:
+    with serving(tmp_path / "service", database_url=any_database, webhook_hosts=["127.0.0.1"]) as running:
         yield running
 
 
@@ -54,6 +55,11 @@ def requests_of(service: Running, folder: Path) -> dict[str, tuple[Send, Send, A
         job = service.client().post("/v1/jobs", json={"acquisition_id": owner}).json()["id"]
         return posts(f"/v1/jobs/{job}/rerun", body)
 
+    sent = queued_job(service.database, owner, webhook={"url": "http://127.0.0.1:9/", "secret": "0" * 16})
+    other = queued_job(service.database, owner, webhook={"url": "http://127.0.0.1:9/", "secret": "0" * 16})
+    with service.database.session() as session:
+        for job in (sent, other):
+            jobs.request_cancel(session, job)
     key = {"name": "tablet", "scopes": ["read"]}
     rerun = reruns({"priority": "research"})
     return {
@@ -74,6 +80,11 @@ def requests_of(service: Running, folder: Path) -> dict[str, tuple[Send, Send, A
             posts("/v1/jobs", {"acquisition_id": owner}),
             posts("/v1/jobs", {"acquisition_id": owner, "priority": "research"}),
             Job,
+        ),
+        "deliveries.create": (
+            posts(f"/v1/jobs/{sent}/deliveries", {}),
+            posts(f"/v1/jobs/{other}/deliveries", {}),
+            Delivery,
         ),
         "jobs.rerun": (rerun, posts("/v1/jobs", {"acquisition_id": owner}), Job),
     }

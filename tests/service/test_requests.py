@@ -10,13 +10,14 @@ from typing import Any
 import httpx
 import pytest
 
+from specimap_infra.projects import DEFAULT_PROJECT
 from tests.support.job_scene import queued_job
 from tests.support.result_scene import Result, put_result
 from tests.support.service_scene import Running, serving
 from tests.support.upload_scene import TUS, create, new_acquisition, photos, sent
 
 EXAMPLES = {"bands/{band}": "bands/1", "{index}": "3", "{key}": "zarr.json", "{format}": "mesh-ply", "{name}": "x"}
-VOLATILE = {"date", "x-correlation-id", "transfer-encoding"}
+VOLATILE = {"date", "ratelimit", "x-correlation-id", "transfer-encoding"}
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +41,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Running, R
                 "upload_id": upload,
                 "uuid": upload,
                 "key_id": f"key_{'0' * 26}",
+                "project_id": DEFAULT_PROJECT,
             },
         )
 

@@ -21,6 +21,7 @@ from specimap_service.auth.dependencies import Reader, Uploader
 from specimap_service.auth.object_ids import AcquisitionId
 from specimap_service.byte_ranges import ranged_response
 from specimap_service.context import Context, audit
+from specimap_service.paging import After, MaybeLimit, Sort, listed, paged
 
 router = APIRouter(prefix="/v1", tags=["files"])
 BYTES: dict[str, Any] = {
@@ -30,15 +31,24 @@ BYTES: dict[str, Any] = {
 
 
 @router.get("/acquisitions/{acquisition_id}/files", operation_id="files.list")
-def list_files(context: Context, principal: Reader, acquisition_id: AcquisitionId) -> list[File]:
-    """List all files with their judgement, in the order of their arrival."""
+def list_files(
+    context: Context,
+    principal: Reader,
+    request: Request,
+    response: Response,
+    acquisition_id: AcquisitionId,
+    after: After = None,
+    limit: MaybeLimit = None,
+    sort: Sort = "created_at",
+) -> list[File]:
+    """List the files with their judgement, by default in the order of their arrival."""
+    query = sa.select(StoredFile).where(StoredFile.acquisition_id == acquisition_id)
     with context.database.session() as session:
         if session.get(Acquisition, acquisition_id) is None:
             raise not_found(acquisition_id)
-        rows = session.scalars(
-            sa.select(StoredFile).where(StoredFile.acquisition_id == acquisition_id).order_by(StoredFile.id)
-        )
-        return [File.model_validate(row) for row in rows]
+        rows = session.scalars(paged(query, StoredFile.id, after, limit, sort))
+        files = [File.model_validate(row) for row in rows]
+    return listed(request, response, files, [file.id for file in files], limit)
 
 
 @router.get("/acquisitions/{acquisition_id}/files/{file_id}", operation_id="files.get")

@@ -27,7 +27,7 @@ from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import Context, audit
 from specimap_service.idempotency import IdempotencyKey, Repeatable, repeated
 from specimap_service.jobs.deletion import JobFiles
-from specimap_service.paging import After, InProject, Limit, Moment, Page, page_of
+from specimap_service.paging import After, CreatedAfter, CreatedBefore, InProject, Limit, Page, Sort, page_of, paged
 
 router = APIRouter(prefix="/v1", tags=["acquisitions"])
 PSEUDONYM = r"^[A-Za-z0-9._-]{1,64}$"
@@ -114,17 +114,19 @@ def create_acquisition(
 def list_acquisitions(
     context: Context,
     principal: Reader,
-    specimen_id: Annotated[str | None, Query(max_length=64)] = None,
-    accession_number: Annotated[str | None, Query(max_length=64)] = None,
-    created_after: Annotated[Moment | None, Query(description="Only those created at this time or later.")] = None,
-    created_before: Annotated[Moment | None, Query(description="Only those created before this time.")] = None,
+    specimen_id: Annotated[str | None, Query(max_length=64, description="Only those of this specimen.")] = None,
+    accession_number: Annotated[
+        str | None, Query(max_length=64, description="Only those with this accession number.")
+    ] = None,
+    created_after: CreatedAfter = None,
+    created_before: CreatedBefore = None,
     project: InProject = None,
     after: After = None,
     limit: Limit = 50,
+    sort: Sort = "-created_at",
 ) -> Page[AcquisitionView]:
-    """List acquisitions, newest first."""
+    """List acquisitions."""
     query = sa.select(Acquisition).where(in_sight(principal, Acquisition, project))
-    query = query.order_by(Acquisition.id.desc()).limit(limit + 1)
     for column, value in ((Acquisition.specimen_id, specimen_id), (Acquisition.accession_number, accession_number)):
         if value is not None:
             query = query.where(column == value)
@@ -132,8 +134,7 @@ def list_acquisitions(
         query = query.where(Acquisition.created_at >= created_after)
     if created_before is not None:
         query = query.where(Acquisition.created_at < created_before)
-    if after is not None:
-        query = query.where(Acquisition.id < after)
+    query = paged(query, Acquisition.id, after, limit, sort)
     with context.database.session() as session:
         rows = list(session.scalars(query))
         views = [_view(session, row) for row in rows]

@@ -14,9 +14,9 @@ from specimap_infra.errors import DatabaseUnavailableError
 from specimap_service.app_state import AppState
 from specimap_service.auth.access import Access
 from specimap_service.auth.keys import KEPT_SECONDS, Keyring, Principal
-from specimap_service.auth.rate_limit import RateLimiter
-from specimap_service.context import AppContext
-from specimap_service.errors import ForbiddenError, UnauthorizedError
+from specimap_service.auth.rate_limit import Left, RateLimiter
+from specimap_service.context import ANSWER_HEADERS, AppContext
+from specimap_service.errors import ForbiddenError, RateLimitedError, UnauthorizedError
 from specimap_service.feature import Feature
 
 FAILURES_PER_MINUTE = 60
@@ -58,7 +58,13 @@ async def authenticated(request: Request) -> Principal:
         address = request.client.host if request.client else "unknown"
         limiter.take(f"address:{address}", FAILURES_PER_MINUTE)
         raise
-    limiter.take(found.key_id, found.rate_per_minute)
+    try:
+        left = limiter.take(found.key_id, found.rate_per_minute)
+    except RateLimitedError as error:
+        left = Left(found.rate_per_minute, 0, error.details["retry_after_s"])
+        raise
+    finally:
+        request.scope.get(ANSWER_HEADERS, {}).update(left.headers())
     structlog.contextvars.bind_contextvars(key=found.key_id)
     return found
 

@@ -6,7 +6,7 @@ import datetime
 from typing import Annotated
 
 import sqlalchemy as sa
-from fastapi import APIRouter, Response
+from fastapi import APIRouter, Request, Response
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 from sqlalchemy.orm import Session
 
@@ -17,6 +17,7 @@ from specimap_service.auth.dependencies import Admin, Reader
 from specimap_service.auth.object_ids import ProjectId
 from specimap_service.context import Context, audit
 from specimap_service.idempotency import IdempotencyKey, Repeatable, repeated
+from specimap_service.paging import After, MaybeLimit, Sort, listed, paged
 
 router = APIRouter(prefix="/v1", tags=["projects"])
 
@@ -66,11 +67,20 @@ def create_project(
 
 
 @router.get("/projects", operation_id="projects.list")
-def list_projects(context: Context, principal: Reader) -> list[Project]:
+def list_projects(
+    context: Context,
+    principal: Reader,
+    request: Request,
+    response: Response,
+    after: After = None,
+    limit: MaybeLimit = None,
+    sort: Sort = "created_at",
+) -> list[Project]:
     """List the projects that the key sees: its own, for an administrator all."""
+    query = paged(sa.select(ProjectRow).where(in_sight(principal, ProjectRow)), ProjectRow.id, after, limit, sort)
     with context.database.session() as session:
-        query = sa.select(ProjectRow).where(in_sight(principal, ProjectRow)).order_by(ProjectRow.id)
-        return [Project.model_validate(row) for row in session.scalars(query)]
+        projects = [Project.model_validate(row) for row in session.scalars(query)]
+    return listed(request, response, projects, [project.id for project in projects], limit)
 
 
 @router.get("/projects/{project_id}", operation_id="projects.get")

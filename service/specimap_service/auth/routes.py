@@ -20,7 +20,7 @@ from specimap_service.auth.object_ids import KeyId
 from specimap_service.context import Context, audit
 from specimap_service.errors import RequestInvalidError
 from specimap_service.idempotency import IdempotencyKey, Repeatable, repeated
-from specimap_service.paging import InProject, Limit, Moment, Page, page_of
+from specimap_service.paging import After, InProject, Limit, MaybeLimit, Moment, Page, Sort, listed, page_of, paged
 
 router = APIRouter(prefix="/v1", tags=["keys"])
 
@@ -129,11 +129,21 @@ def create_key(
 
 
 @router.get("/keys", operation_id="keys.list")
-def list_keys(context: Context, principal: Admin, project: InProject = None) -> list[Key]:
-    """List all keys, revoked ones too."""
-    query = sa.select(ApiKey).where(in_sight(principal, ApiKey, project)).order_by(ApiKey.id)
+def list_keys(
+    context: Context,
+    principal: Admin,
+    request: Request,
+    response: Response,
+    project: InProject = None,
+    after: After = None,
+    limit: MaybeLimit = None,
+    sort: Sort = "created_at",
+) -> list[Key]:
+    """List the keys, revoked ones too."""
+    query = paged(sa.select(ApiKey).where(in_sight(principal, ApiKey, project)), ApiKey.id, after, limit, sort)
     with context.database.session() as session:
-        return [Key.model_validate(row) for row in session.scalars(query)]
+        keys = [Key.model_validate(row) for row in session.scalars(query)]
+    return listed(request, response, keys, [key.id for key in keys], limit)
 
 
 @router.delete("/keys/{key_id}", status_code=204, operation_id="keys.revoke")
@@ -156,18 +166,13 @@ def list_audit(
     project: InProject = None,
     after: Annotated[int | None, Query(ge=1, description="`next` of the page before.")] = None,
     limit: Limit = 100,
+    sort: Sort = "-created_at",
 ) -> Page[Audited]:
-    """List the audit trail, newest entry first."""
-    query = (
-        sa.select(AuditEntry)
-        .where(in_sight(principal, AuditEntry, project))
-        .order_by(AuditEntry.id.desc())
-        .limit(limit + 1)
-    )
+    """List the audit trail."""
+    query = sa.select(AuditEntry).where(in_sight(principal, AuditEntry, project))
     if target is not None:
         query = query.where(AuditEntry.target == target)
-    if after is not None:
-        query = query.where(AuditEntry.id < after)
+    query = paged(query, AuditEntry.id, after, limit, sort)
     with context.database.session() as session:
         rows = list(session.scalars(query))
     return page_of([Audited.model_validate(row) for row in rows], [str(row.id) for row in rows], limit)

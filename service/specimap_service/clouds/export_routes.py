@@ -26,6 +26,7 @@ from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.clouds.open_clouds import CloudRecord
 from specimap_service.context import AppContext, Context, audit, correlation_id
 from specimap_service.idempotency import IdempotencyKey, Repeatable
+from specimap_service.paging import After, MaybeLimit, Sort, listed, part_of
 
 router = APIRouter(prefix="/v1/clouds/{cloud_id}/exports", tags=["exports"])
 
@@ -125,13 +126,25 @@ def _made(
 
 
 @router.get("", operation_id="exports.list")
-def list_exports(context: Context, principal: Reader, clouds: CloudsDep, cloud_id: CloudId) -> list[Export]:
+def list_exports(
+    context: Context,
+    principal: Reader,
+    clouds: CloudsDep,
+    request: Request,
+    response: Response,
+    cloud_id: CloudId,
+    after: After = None,
+    limit: MaybeLimit = None,
+    sort: Sort = "-created_at",
+) -> list[Export]:
     """List the files that exist or are being made; `mesh-ply` always exists."""
     cloud = clouds.record(cloud_id)
-    query = sa.select(tables.Export).where(tables.Export.cloud_id == cloud_id).order_by(tables.Export.id.desc())
+    query = sa.select(tables.Export).where(tables.Export.cloud_id == cloud_id)
     with context.database.session() as session:
-        rows = list(session.scalars(query))
-    return [*map(_view, rows), _mesh_ply(context, cloud)]
+        exports = [_mesh_ply(context, cloud), *map(_view, session.scalars(query))]
+    # The mesh is as old as the cloud, so its place is among the others.
+    exports = part_of(exports, lambda export: export.id, after, limit, sort)
+    return listed(request, response, exports, [export.id for export in exports], limit)
 
 
 @router.get("/{format}", operation_id="exports.get")

@@ -17,7 +17,7 @@ from specimap_service.auth.object_ids import CloudId
 from specimap_service.byte_ranges import ranged_response
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import Context
-from specimap_service.paging import After, InProject, Limit, Page, page_of
+from specimap_service.paging import After, InProject, Limit, Page, Sort, page_of, paged
 
 router = APIRouter(prefix="/v1", tags=["clouds"])
 
@@ -54,13 +54,14 @@ class CloudAnswer(CloudSummary):
 def list_clouds(
     context: Context,
     principal: Reader,
-    acquisition_id: Annotated[str | None, Query(max_length=64)] = None,
-    specimen_id: Annotated[str | None, Query(max_length=200)] = None,
+    acquisition_id: Annotated[str | None, Query(max_length=64, description="Only those of this acquisition.")] = None,
+    specimen_id: Annotated[str | None, Query(max_length=200, description="Only those of this specimen.")] = None,
     project: InProject = None,
     after: After = None,
     limit: Limit = 100,
+    sort: Sort = "-created_at",
 ) -> Page[CloudSummary]:
-    """List finished clouds, newest first."""
+    """List finished clouds."""
     query = sa.select(CloudRow).join(Job, Job.id == CloudRow.job_id).where(Job.state == "succeeded")
     query = query.where(in_sight(principal, CloudRow, project))
     if acquisition_id is not None:
@@ -68,9 +69,7 @@ def list_clouds(
     if specimen_id is not None:
         query = query.join(Acquisition, Acquisition.id == CloudRow.acquisition_id)
         query = query.where(Acquisition.specimen_id == specimen_id)
-    if after is not None:
-        query = query.where(CloudRow.id < after)
-    query = query.order_by(CloudRow.id.desc()).limit(limit + 1).options(sa.orm.defer(CloudRow.report))
+    query = paged(query, CloudRow.id, after, limit, sort).options(sa.orm.defer(CloudRow.report))
     with context.database.session() as session:
         rows = list(session.scalars(query))
     return page_of([CloudSummary.model_validate(row) for row in rows], [row.id for row in rows], limit)

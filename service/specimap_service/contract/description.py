@@ -15,6 +15,7 @@ from pydantic.json_schema import models_json_schema
 from specimap_service.auth.dependencies import SCOPE_OF
 from specimap_service.contract.events import describe_events
 from specimap_service.contract.examples import add_examples
+from specimap_service.contract.headers import describe_headers
 from specimap_service.contract.refusals import Refusals
 from specimap_service.uploads.tus import PREFIX
 from specimap_service.uploads.tus_routes import NOT_SERVED
@@ -79,6 +80,7 @@ def _complete(app: FastAPI, contract: dict[str, Any]) -> None:
             operation["security"] = [{name: [scope] for name in need} for need in operation["security"]]
             note = f"Scope: `{scope}`."
             operation["description"] = f"{operation.get('description', '')}\n\n{note}".strip()
+        describe_headers(operation)
         refusals.add(method, path, operation)
         describe_events(operation)
 

@@ -43,6 +43,7 @@ OWN: dict[str, tuple[Refusal, ...]] = {
     "acquisitions.delete": (infra.JobConflictError, infra.StorageUnavailableError),
     "clouds.get": _CLOUD,
     "clouds.get_corners": _RANGES,
+    "deliveries.create": (core.SettingsError, infra.JobConflictError),
     "exports.create": _CLOUD,
     "exports.get": _CLOUD,
     "exports.get_content": (*_RANGES, infra.JobConflictError),

@@ -35,7 +35,7 @@ from specimap_service.jobs.schemas import (
     LogLine,
     RerunRequest,
 )
-from specimap_service.paging import InProject, Limit, Moment, Page, page_of
+from specimap_service.paging import CreatedAfter, CreatedBefore, InProject, Limit, Page, Sort, page_of, paged
 
 router = APIRouter(prefix="/v1", tags=["jobs"])
 
@@ -77,16 +77,19 @@ def _answer(response: Response, job: JobView, made: bool) -> JobView:
 def list_jobs(
     context: Context,
     principal: Reader,
-    acquisition_id: Annotated[str | None, Query(pattern=r"^acq_[0-9a-z]{26}$")] = None,
+    acquisition_id: Annotated[
+        str | None, Query(pattern=r"^acq_[0-9a-z]{26}$", description="Only jobs on this one.")
+    ] = None,
     state: Annotated[list[JobState] | None, Query(description="Any of these states.")] = None,
-    created_after: Moment | None = None,
-    created_before: Moment | None = None,
+    created_after: CreatedAfter = None,
+    created_before: CreatedBefore = None,
     project: InProject = None,
     after: AfterJob = None,
     limit: Limit = 100,
+    sort: Sort = "-created_at",
 ) -> Page[JobView]:
-    """List jobs, newest first."""
-    query = sa.select(Job).where(in_sight(principal, Job, project)).order_by(Job.id.desc()).limit(limit + 1)
+    """List jobs."""
+    query = sa.select(Job).where(in_sight(principal, Job, project))
     if acquisition_id is not None:
         query = query.where(Job.acquisition_id == acquisition_id)
     if state:
@@ -95,8 +98,7 @@ def list_jobs(
         query = query.where(Job.created_at >= created_after)
     if created_before is not None:
         query = query.where(Job.created_at < created_before)
-    if after is not None:
-        query = query.where(Job.id < after)
+    query = paged(query, Job.id, after, limit, sort)
     with context.database.session() as session:
         jobs = job_views(session, list(session.scalars(query)))
     return page_of(jobs, [job.id for job in jobs], limit)
@@ -147,15 +149,16 @@ def get_report(context: Context, principal: Reader, job_id: JobId) -> Report:
 
 @router.get("/jobs/{job_id}/log", operation_id="jobs.get_log")
 def get_log(
-    context: Context, principal: Reader, job_id: JobId, after: AfterSeq = None, limit: Limit = 100
+    context: Context,
+    principal: Reader,
+    job_id: JobId,
+    after: AfterSeq = None,
+    limit: Limit = 100,
+    sort: Sort = "created_at",
 ) -> Page[LogLine]:
-    """Return the job's log, oldest line first."""
-    query = (
-        sa.select(JobEvent)
-        .where(JobEvent.job_id == job_id, JobEvent.type == "log", JobEvent.seq > (after or 0))
-        .order_by(JobEvent.seq)
-        .limit(limit + 1)
-    )
+    """Return the job's log."""
+    query = sa.select(JobEvent).where(JobEvent.job_id == job_id, JobEvent.type == "log")
+    query = paged(query, JobEvent.seq, after, limit, sort)
     with context.database.session() as session:
         found_job(session, job_id)
         lines = [
