@@ -29,6 +29,7 @@ from tests.support.places import ROOT, SUPPORT
 from tests.support.result_scene import put_result
 from tests.support.service_scene import Running
 
+REFUSED = ["400", "401", "403", "404", "405", "406", "409", "412", "413", "415", "422", "428", "429", "5xx"]
 EXAMPLES = 12
 """Generated requests for each operation."""
 
@@ -238,6 +239,8 @@ def test_generated_requests_are_answered_as_the_contract_says(service: Running, 
     (tmp_path / "schemathesis.toml").write_text(
         f'[parameters]\n"path.cloud_id" = "{result.cloud_id}"\n"path.job_id" = "{result.job_id}"\n'
         f'"path.acquisition_id" = "{result.acquisition_id}"\n'
+        # tus wants 412 for another version of the protocol.
+        f"[checks.negative_data_rejection]\nexpected-statuses = {REFUSED}\n"
         f'[auth.openapi.key]\nbearer = "{service.key(rate_per_minute=1_000_000)}"\n',
         "utf-8",
     )
@@ -257,7 +260,8 @@ def test_generated_requests_are_answered_as_the_contract_says(service: Running, 
             "--workers",
             "2",
             "--exclude-checks",
-            "unsupported_method,negative_data_rejection,positive_data_acceptance",
+            # What fits the schema may still name bands, points or jobs that are not there.
+            "positive_data_acceptance",
             "--generation-database",
             "none",
             "--no-color",

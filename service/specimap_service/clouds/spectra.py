@@ -133,7 +133,7 @@ class SpectraRequest(_Strict):
         extra="forbid",
         json_schema_extra={
             "example": {
-                "select": {"radius": {"centre": [3.5, -2.0, 4.1], "radius_mm": 1.5}},
+                "select": {"radius": {"centre": [2.0, -3.0, 7.0], "radius_mm": 6}},
                 "bands": {"nm": [500, 700]},
                 "fields": ["xyz", "distance_mm"],
             }

@@ -18,7 +18,7 @@ from specimap_service.contract.examples import add_examples
 from specimap_service.contract.headers import describe_headers
 from specimap_service.contract.refusals import Refusals
 from specimap_service.uploads.tus import PREFIX
-from specimap_service.uploads.tus_routes import NOT_SERVED
+from specimap_service.uploads.tus_routes import NEEDED, NOT_SERVED
 
 SCHEMAS = "#/components/schemas/"
 HTTP_HEADERS = ("content-length", "content-type")
@@ -72,6 +72,10 @@ def _complete(app: FastAPI, contract: dict[str, Any]) -> None:
         hidden = {*HTTP_HEADERS, *(NOT_SERVED.get(method.upper(), ()) if path.startswith(PREFIX) else ())}
         given = operation.get("parameters", [])
         operation["parameters"] = [p for p in given if p["name"].lower() not in hidden]
+        for parameter in operation["parameters"]:
+            if parameter["in"] == "header" and parameter["name"] in NEEDED:
+                # The library reads them as if they were optional; without them it refuses.
+                parameter |= {"required": True, "schema": NEEDED[parameter["name"]]}
         if route.summary is None:
             operation["summary"] = re.split(r"[.:;] ", operation["description"].strip().rstrip(".") + ". ")[0]
         scope = scope_of(route)

@@ -180,6 +180,13 @@ DOCUMENTED: dict[str, dict[str, Any]] = {
 }
 
 
+NEEDED: dict[str, dict[str, Any]] = {
+    "tus-resumable": {"type": "string", "enum": [tus.VERSION]},
+    "upload-metadata": {"type": "string"},
+    "upload-length": {"type": "integer", "minimum": 1},
+    "upload-offset": {"type": "integer", "minimum": 0},
+}
+"""Headers without which the library's routes that have them refuse."""
 NOT_SERVED: dict[str, tuple[str, ...]] = {
     "POST": ("upload-concat", "upload-defer-length"),
     "PATCH": ("upload-length", "post_request"),
