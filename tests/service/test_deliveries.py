@@ -10,9 +10,9 @@ import pytest
 
 from specimap_infra import jobs
 from specimap_infra.webhooks import deliver_due, webhook_client
-from tests.infra.test_webhooks import Receiver, receiver  # noqa: F401 - a fixture
 from tests.support.job_scene import acquisition, queued_job
 from tests.support.service_scene import Running, serving
+from tests.support.webhook_receiver import Receiver
 
 SECRET = "0123456789abcdef"
 
@@ -23,7 +23,7 @@ def sending(tmp_path: Path) -> Iterator[Running]:
         yield running
 
 
-def test_a_delivery_is_listed_and_made_again(sending: Running, receiver: Receiver) -> None:  # noqa: F811
+def test_a_delivery_is_listed_and_made_again(sending: Running, receiver: Receiver) -> None:
     database, client = sending.database, sending.client(["read", "upload"])
     job = queued_job(database, acquisition(database), webhook={"url": receiver.url, "secret": SECRET})
     at = f"/v1/jobs/{job}/deliveries"
