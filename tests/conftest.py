@@ -20,6 +20,7 @@ pytest_plugins = (
     "tests.support.da3_scene",
     "tests.support.feature_scene",
     "tests.support.secret_file",
+    "tests.support.webhook_receiver",
 )
 
 TEST_DATA_VARIABLE = "SPECIMAP_TEST_DATA"

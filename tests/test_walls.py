@@ -42,9 +42,18 @@ FEATURE_IMPORTS = {
     "jobs": {"auth", "clouds"},  # deleting a job closes its clouds
     "acquisitions": {"auth", "jobs", "clouds"},  # deleting an acquisition removes its jobs' results
     "uploads": {"auth", "acquisitions"},  # an upload becomes a file of an acquisition
+    # The description of the API.
+    "contract": {"auth", "jobs", "uploads"},
 }
 """Features of the service, and which others each may import."""
-SHARED_IMPORTS = {"health": {"auth"}, "body_limits": {"auth"}, "space": {"auth"}, "app": set(FEATURE_IMPORTS)}
+SHARED_IMPORTS = {
+    "health": {"auth"},
+    "body_limits": {"auth"},
+    "space": {"auth"},
+    "idempotency": {"auth"},
+    "query_parameters": {"uploads"},
+    "app": set(FEATURE_IMPORTS),
+}
 """Modules next to the features that may import some; all others import none."""
 HEAVY = ("cv2", "open3d", "pycolmap", "embreex", "scipy", "torch")
 LIGHT = (

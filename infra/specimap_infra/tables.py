@@ -166,6 +166,7 @@ class Job(Base):
     executor: Mapped[str | None]
     """The worker that may write to this row: one that lost its lease finds another's name here."""
     idempotency_key: Mapped[str | None]
+    """Of jobs from before :class:`RepeatableRequest`; nobody writes or reads it."""
     request_hash: Mapped[str]
     correlation_id: Mapped[str]
     rerun_of: Mapped[str | None]
@@ -175,6 +176,21 @@ class Job(Base):
     started_at: Mapped[datetime.datetime | None]
     finished_at: Mapped[datetime.datetime | None]
     created_by: Mapped[str]
+
+
+class RepeatableRequest(Base):
+    """A request with an idempotency key: sent again, it finds what it made. Kept for some days."""
+
+    __tablename__ = "repeatable_requests"
+
+    key_id: Mapped[str] = mapped_column(primary_key=True)
+    name: Mapped[str] = mapped_column(primary_key=True)
+    """The idempotency key, a name that the client gave."""
+    request_hash: Mapped[str]
+    object_id: Mapped[str]
+    salt: Mapped[str]
+    """Of the secret of a key that the request made: with it, and the key that made the request, it is shown again."""
+    created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now, index=True)
 
 
 class JobEvent(Base):

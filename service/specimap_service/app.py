@@ -11,7 +11,7 @@ from starlette.middleware.cors import CORSMiddleware
 
 from specimap_core import __version__
 from specimap_infra.settings import ServiceSettings
-from specimap_service import health, problems
+from specimap_service import health, idempotency, problems
 from specimap_service.acquisitions import dependencies as acquisitions
 from specimap_service.acquisitions import file_routes
 from specimap_service.acquisitions import routes as acquisition_routes
@@ -23,10 +23,14 @@ from specimap_service.clouds import dependencies as clouds
 from specimap_service.clouds import export_routes, label_routes, preview_routes, spectra_routes, zarr_routes
 from specimap_service.clouds import routes as cloud_routes
 from specimap_service.clouds.spectra import SpectraRequest
+from specimap_service.compression import Compression
 from specimap_service.context import CONTEXT, AppContext
+from specimap_service.contract.description import describe
 from specimap_service.head_requests import HeadRequests
+from specimap_service.jobs import delivery_routes
 from specimap_service.jobs import dependencies as jobs
 from specimap_service.jobs import routes as job_routes
+from specimap_service.jobs.schemas import EVENT_TYPES
 from specimap_service.middleware import RequestObserver
 from specimap_service.query_parameters import check_query
 from specimap_service.uploads import dependencies as uploads
@@ -40,7 +44,7 @@ spectrum. Every call but `/healthz` and `/readyz` takes a key: `Authorization: B
 operation does not know is refused. Within `/v1` the contract only grows.
 """
 
-FEATURES = (auth.FEATURE, acquisitions.FEATURE, uploads.FEATURE, jobs.FEATURE, clouds.FEATURE)
+FEATURES = (idempotency.FEATURE, auth.FEATURE, acquisitions.FEATURE, uploads.FEATURE, jobs.FEATURE, clouds.FEATURE)
 """Opened in this order, closed in the reverse one: uploads use the judge of acquisitions."""
 ROUTES = (
     health,
@@ -51,6 +55,7 @@ ROUTES = (
     file_routes,
     upload_routes,
     job_routes,
+    delivery_routes,
     cloud_routes,
     zarr_routes,
     spectra_routes,
@@ -84,6 +89,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         description=DESCRIPTION,
         license_info={"name": "Apache-2.0", "identifier": "Apache-2.0"},
         responses=problems.RESPONSES,
+        servers=[{"url": "/", "description": "The service that this document comes from."}],
         dependencies=[Depends(check_query)],
         redirect_slashes=False,
         lifespan=lifespan,
@@ -93,11 +99,12 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     for feature in FEATURES:
         feature.open(app, context)
     problems.add_handlers(app)
-    problems.describe(app, extra_models=[SpectraRequest])
+    describe(app, extra_models=[SpectraRequest, *EVENT_TYPES.values()])
     for routes in ROUTES:
         app.include_router(routes.router)
     # The last one added sees a request first: the limits come after CORS and the corrections of uploads, and before
     # everything that reads a body.
+    app.add_middleware(Compression)
     app.add_middleware(HeadRequests)
     app.add_middleware(BodyLimits)
     tus_routes.mount(app)
@@ -119,7 +126,10 @@ EXPOSED = [
     "Content-Length",
     "Content-Range",
     "ETag",
+    "Link",
     "Location",
+    "RateLimit",
+    "RateLimit-Policy",
     "Retry-After",
     "X-Correlation-Id",
     "Tus-Resumable",

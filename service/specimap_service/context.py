@@ -19,6 +19,9 @@ from specimap_infra.tables import AuditEntry
 from specimap_service.app_state import AppState
 from specimap_service.metrics import Metrics
 
+ANSWER_HEADERS = "specimap.headers"
+"""Key under which a request's ASGI scope holds headers for its answer, whatever that will be."""
+
 
 @dataclass(frozen=True)
 class AppContext:

@@ -31,13 +31,13 @@ class Readiness(BaseModel):
     workers: int
 
 
-@router.get("/healthz")
+@router.get("/healthz", operation_id="health.get")
 async def healthz() -> Health:
     """Check that the process answers; neither database nor storage is asked."""
     return Health(status="ok", version=__version__)
 
 
-@router.get("/readyz")
+@router.get("/readyz", operation_id="health.get_readiness")
 def readyz(context: Context) -> Readiness:
     """Check that requests can be served: 503 with a code where the database or the storage does not answer."""
     with context.database.session() as session:
@@ -47,7 +47,12 @@ def readyz(context: Context) -> Readiness:
     return Readiness(status="ready", workers=workers)
 
 
-@router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
+@router.get(
+    "/metrics",
+    response_class=Response,
+    responses={200: {"content": {"text/plain": {}}}},
+    operation_id="health.get_metrics",
+)
 def metrics(context: Context, principal: Admin) -> Response:
     """Return the metrics in Prometheus' text format."""
     return Response(context.metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")

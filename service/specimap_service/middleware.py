@@ -11,6 +11,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from specimap_core.errors import SpecimapError
 from specimap_infra.logs import logger
+from specimap_service.context import ANSWER_HEADERS
 from specimap_service.metrics import Metrics
 from specimap_service.problems import problem_response
 
@@ -38,6 +39,8 @@ class RequestObserver:
         correlation = given.decode() if ACCEPTED.match(given) else secrets.token_hex(8)
         structlog.contextvars.clear_contextvars()
         structlog.contextvars.bind_contextvars(correlation_id=correlation)
+        more: dict[str, str] = {}
+        scope[ANSWER_HEADERS] = more
         start, status = time.perf_counter(), 0
 
         async def observed_send(message: Message) -> None:
@@ -48,6 +51,7 @@ class RequestObserver:
                     *message.get("headers", []),
                     (HEADER, correlation.encode()),
                     (b"x-content-type-options", b"nosniff"),
+                    *((name.lower().encode(), value.encode()) for name, value in more.items()),
                 ]
             await send(message)
 

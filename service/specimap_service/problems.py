@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
-from pydantic.json_schema import models_json_schema
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
@@ -131,29 +129,3 @@ def add_handlers(app: FastAPI) -> None:
             error.status_code,
             **(dict(error.headers) if error.headers else {}),
         )
-
-
-def describe(app: FastAPI, extra_models: Sequence[type[BaseModel]] = ()) -> None:
-    """Leave headers of HTTP itself out of the app's description: the server answers wrong ones before the app.
-
-    ``extra_models``: models of bodies that routes read themselves and only refer to.
-    """
-    original = app.openapi
-    _, extra = models_json_schema(
-        [(model, "validation") for model in extra_models], ref_template="#/components/schemas/{model}"
-    )
-
-    def openapi() -> dict[str, Any]:
-        contract = original()
-        schemas = contract["components"]["schemas"]
-        contract["components"]["schemas"] = dict(sorted((schemas | extra.get("$defs", {})).items()))
-        for operations in contract["paths"].values():
-            for operation in operations.values():
-                given = operation.get("parameters", [])
-                operation["parameters"] = [p for p in given if p["name"].lower() not in HTTP_HEADERS]
-        return contract
-
-    app.openapi = openapi  # type: ignore[method-assign]
-
-
-HTTP_HEADERS = ("content-length", "content-type")

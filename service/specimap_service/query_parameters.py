@@ -10,6 +10,7 @@ from fastapi.params import Query
 from fastapi.routing import APIRoute
 
 from specimap_service.errors import RequestInvalidError
+from specimap_service.uploads.tus_routes import NOT_SERVED
 
 
 async def check_query(request: Request) -> None:
@@ -43,7 +44,8 @@ async def check_query(request: Request) -> None:
 def known_parameters(route: APIRoute) -> dict[str, bool]:
     """Return the query parameters of an operation, and whether each may be given several times."""
     found = [field for field in get_flat_params(route.dependant) if isinstance(field.field_info, Query)]
-    return {field.alias: _is_list(field.field_info.annotation) for field in found}
+    hidden = {name for method in route.methods or () for name in NOT_SERVED.get(method, ())}
+    return {field.alias: _is_list(field.field_info.annotation) for field in found if field.alias not in hidden}
 
 
 def _is_list(annotation: Any) -> bool:

@@ -46,7 +46,7 @@ def test_what_may_have_been_done_is_not_repeated(waits: list[float]) -> None:
     for fault in (BROKEN, problem(503, "x"), problem(500, "x")):
         handler, seen = answers(fault)
         with client_of(handler) as client, pytest.raises(sc.SpecimapClientError):
-            client.acquisitions.create("S26-1")
+            client.jobs._session.json("POST", "v1/unnamed", json={})
         assert len(seen) == 1
     assert waits == []
 
@@ -55,7 +55,7 @@ def test_what_was_not_taken_is_repeated_even_if_it_makes_something(waits: list[f
     limited = problem(429, "rate_limited", {"Retry-After": "7"}, retry_after_s=7)
     handler, seen = answers(REFUSED, limited, problem(422, "request_invalid"))
     with client_of(handler) as client, pytest.raises(sc.Refused):
-        client.acquisitions.create("S26-1")
+        client.jobs._session.json("POST", "v1/unnamed", json={})
     assert len(seen) == 3
     assert 7.0 <= waits[1] <= 9.0
 
@@ -68,6 +68,19 @@ def test_job_is_submitted_again_under_the_same_idempotency_key(waits: list[float
     keys = [request.headers["Idempotency-Key"] for request in seen]
     assert len(set(keys[:3])) == 1
     assert keys[3] != keys[0]
+
+
+def test_what_creates_is_repeated_under_one_idempotency_key(waits: list[float]) -> None:
+    for create in (
+        lambda client: client.acquisitions.create("S26-1"),
+        lambda client: client.keys.create("tablet", ["read"]),
+        lambda client: client.projects.create("study-7"),
+    ):
+        handler, seen = answers(BROKEN, problem(503, "x"), problem(422, "request_invalid"))
+        with client_of(handler) as client, pytest.raises(sc.Refused):
+            create(client)
+        assert len(seen) == 3
+        assert len({request.headers["Idempotency-Key"] for request in seen}) == 1
 
 
 def test_deletion_whose_answer_was_lost_has_succeeded(waits: list[float]) -> None:

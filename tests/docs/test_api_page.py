@@ -17,6 +17,7 @@ import httpx
 import numpy as np
 import pyarrow as pa
 import pytest
+from matplotlib.path import Path as Outline
 
 from specimap_core.cloud import Cloud
 from specimap_infra import jobs
@@ -220,16 +221,16 @@ def spectra(reader: Reader, cloud: Cloud) -> None:
     (point,) = documents(reader.sh("Spectra"))
     assert (point["index"], point["bands"]) == (17, [0, 3, 4, 5])
     selections = [answer["indices"] for answer in documents(reader.sh("Spectra"))]
-    pixels = [index for row, col in ((40, 25), (41, 25)) if (index := cloud.at_pixel(row, col)) is not None]
-    centre = (2.0, -3.0, 0.0)
-    triangle = cloud.in_polygon([(10, 10), (10, 30), (40, 20)])
-    near = cloud.in_radius(centre, 1.5)
+    pixels = [index for row, col in ((200, 200), (201, 200)) if (index := cloud.at_pixel(row, col)) is not None]
+    centre = (2.0, -3.0, 7.0)
+    triangle = cloud.in_polygon([(10, 10), (10, 30), (210, 210)])
+    near = cloud.in_radius(centre, 6)
     expected: list[Any] = [
         [17, 4, 5],
         pixels,
         triangle,
         cloud.nearest(centre, 8)[0],
-        cloud.in_box((0, -4, -5), (4, 0, 5)),
+        cloud.in_box((0, -4, -5), (4, 0, 15)),
         near,
     ]
     assert selections == [list(indices) for indices in expected]
@@ -278,3 +279,28 @@ def test_metrics_on_the_page_are_those_of_the_service(reader: Reader) -> None:
     text = reader.client.get("/metrics").text
     served = {name for name in re.findall(r"^# TYPE (\w+) ", text, re.MULTILINE) if not name.endswith("_created")}
     assert served == set(re.findall(r"`(specimap_[a-z_]+)`", PAGE.read_text("utf-8")))
+
+
+def test_examples_of_selections_hit_the_sample() -> None:
+    """Judged by the truth of the sample: a reader who follows the page on it gets points."""
+    with np.load(SAMPLES / "truth.npz") as truth:
+        xyz, kind = truth["hsi_xyz"], truth["hsi_class"]
+    there = kind > 0
+    page = PAGE.read_text("utf-8")
+    wanted = [json.loads(text) for text in re.findall(r"""spectra '(\{"select": .*\})'""", page)]
+    seen = set()
+    for select in (item["select"] for item in wanted):
+        (name, given), *_ = select.items()
+        seen.add(name)
+        if name == "pixels":
+            assert all(there[row, col] for row, col in given)
+        elif name == "box":
+            inside = np.all((xyz >= given["low"]) & (xyz <= given["high"]), axis=-1)
+            assert (inside & there).sum() > 100
+        elif name == "radius":
+            near = np.linalg.norm(xyz - np.array(given["centre"]), axis=-1) <= given["radius_mm"]
+            assert (near & there).sum() > 40
+        elif name == "polygon":
+            rows, cols = np.nonzero(there)
+            assert Outline(np.array(given)).contains_points(np.column_stack([rows, cols])).sum() > 100
+    assert seen == {"indices", "pixels", "polygon", "nearest", "box", "radius"}

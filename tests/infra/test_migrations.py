@@ -178,6 +178,14 @@ def test_data_of_the_first_version_come_into_the_default_project(first: Database
     first.close()
 
 
+def test_idempotency_keys_of_jobs_go_on_working(first: Database) -> None:
+    migrate(first)
+    with first.session() as session:
+        rows = session.execute(sa.text("SELECT key_id, name, request_hash, object_id FROM repeatable_requests")).all()
+    assert [tuple(row) for row in rows] == [("key_tablet", "once", "h", "job_1")]
+    first.close()
+
+
 def test_schema_is_that_of_the_tables(first: Database) -> None:
     migrate(first)
     with first.engine.connect() as connection:

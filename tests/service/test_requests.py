@@ -17,7 +17,7 @@ from tests.support.service_scene import Running, serving
 from tests.support.upload_scene import TUS, create, new_acquisition, photos, sent
 
 EXAMPLES = {"bands/{band}": "bands/1", "{index}": "3", "{key}": "zarr.json", "{format}": "mesh-ply", "{name}": "x"}
-VOLATILE = {"date", "x-correlation-id", "transfer-encoding"}
+VOLATILE = {"date", "ratelimit", "x-correlation-id", "transfer-encoding"}
 
 
 @pytest.fixture(scope="module")

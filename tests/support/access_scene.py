@@ -200,6 +200,9 @@ CASES: dict[tuple[str, str], Case] = {
     ("GET", f"{JOB}/report"): _read(),
     ("GET", f"{JOB}/log"): _read(),
     ("GET", f"{JOB}/events"): _read(status=204),
+    ("GET", f"{JOB}/deliveries"): _read(),
+    # A job without a webhook: allowed, but there is nothing to send.
+    ("POST", f"{JOB}/deliveries"): Case("upload", 409, aims=True),
     ("POST", f"{JOB}/rerun"): Case("upload", 202, aims=True),
     # clouds
     ("GET", "/v1/clouds"): Case("read"),

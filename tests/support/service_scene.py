@@ -31,6 +31,7 @@ from specimap_service.app import create_app
 from specimap_service.auth.keys import new_key
 from specimap_service.server import server_config
 from tests.support.databases import create_tables
+from tests.support.documented import check_refusal
 
 ALL_SCOPES = ("upload", "read", "label", "intraoperative", "admin")
 
@@ -79,7 +80,8 @@ class Running:
     ) -> httpx.Client:
         """A client with a new key of these scopes; closed with the service."""
         headers = {"Authorization": f"Bearer {self.key(scopes, project=project, **options)}"}
-        client = httpx.Client(base_url=self.url, headers=headers, timeout=60, trust_env=False)
+        hooks = {"response": [check_refusal]}
+        client = httpx.Client(base_url=self.url, headers=headers, timeout=60, trust_env=False, event_hooks=hooks)
         self.clients.append(client)
         return client
 

@@ -35,7 +35,7 @@ class Acquisitions:
             "edge_mm": edge_mm,
             "notes": notes,
         }
-        return Acquisition.of(self._session.json("POST", path("acquisitions"), json=body))
+        return Acquisition.of(self._session.create(path("acquisitions"), body))
 
     def get(self, acquisition: Acquisition | str) -> Acquisition:
         """The acquisition as it is now."""

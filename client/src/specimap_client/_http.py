@@ -129,6 +129,13 @@ class Session:
             _retries.sleep(self.retries.delay(attempt, wait))
         raise AssertionError("Retries.attempts is at least 1")
 
+    def create(self, address: str, body: Any) -> Any:
+        """The JSON value of what a POST makes, once, however often the request has to be repeated.
+
+        Raises as :meth:`request` does.
+        """
+        return self.json("POST", address, json=body, headers={"Idempotency-Key": str(uuid.uuid4())})
+
     def json(self, method: str, address: str, **options: Any) -> Any:
         """The JSON value of an answer. Raises as :meth:`request` does."""
         return json_of(self.request(method, address, **options))

@@ -42,7 +42,7 @@ class Keys:
         }
         if project is not None:
             body["project"] = id_of(project)
-        return NewKey.of(self._session.json("POST", path("keys"), json=body))
+        return NewKey.of(self._session.create(path("keys"), body))
 
     def list(self, *, project: Project | str | None = None) -> builtins.list[Key]:
         """All keys, revoked ones too; or those of one project."""

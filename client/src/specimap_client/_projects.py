@@ -20,7 +20,7 @@ class Projects:
         Raises:
             Conflict: another project has the name.
         """
-        return Project.of(self._session.json("POST", path("projects"), json={"name": name}))
+        return Project.of(self._session.create(path("projects"), {"name": name}))
 
     def get(self, project: Project | str) -> Project:
         """The project of an id."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import uuid
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -52,9 +53,8 @@ class Tus:
         """The id of a new upload. A lost answer leaves an upload without bytes behind, which expires."""
         metadata = {"acquisition": self._acquisition, "role": role, "filename": file.name}
         pairs = ",".join(f"{name} {base64.b64encode(text.encode()).decode()}" for name, text in metadata.items())
-        answer = self._session.request(
-            "POST", path("uploads"), headers=_TUS | {"Upload-Length": str(size), "Upload-Metadata": pairs}, safe=True
-        )
+        headers = {"Upload-Length": str(size), "Upload-Metadata": pairs, "Idempotency-Key": str(uuid.uuid4())}
+        answer = self._session.request("POST", path("uploads"), headers=_TUS | headers)
         # The id alone: a proxy may have written another host into the address, which must not see the key.
         upload: str = answer.headers.get("Location", "").rstrip("/").rpartition("/")[2]
         if not upload:

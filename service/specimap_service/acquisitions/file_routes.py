@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import PurePosixPath
+from typing import Any
 
 import sqlalchemy as sa
 from fastapi import APIRouter, Request, Response
@@ -20,23 +21,37 @@ from specimap_service.auth.dependencies import Reader, Uploader
 from specimap_service.auth.object_ids import AcquisitionId
 from specimap_service.byte_ranges import ranged_response
 from specimap_service.context import Context, audit
+from specimap_service.paging import After, MaybeLimit, Sort, listed, paged
 
 router = APIRouter(prefix="/v1", tags=["files"])
+BYTES: dict[str, Any] = {
+    "description": "The file's bytes, or the range that was requested",
+    "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+}
 
 
-@router.get("/acquisitions/{acquisition_id}/files")
-def list_files(context: Context, principal: Reader, acquisition_id: AcquisitionId) -> list[File]:
-    """List all files with their judgement, in the order of their arrival."""
+@router.get("/acquisitions/{acquisition_id}/files", operation_id="files.list")
+def list_files(
+    context: Context,
+    principal: Reader,
+    request: Request,
+    response: Response,
+    acquisition_id: AcquisitionId,
+    after: After = None,
+    limit: MaybeLimit = None,
+    sort: Sort = "created_at",
+) -> list[File]:
+    """List the files with their judgement, by default in the order of their arrival."""
+    query = sa.select(StoredFile).where(StoredFile.acquisition_id == acquisition_id)
     with context.database.session() as session:
         if session.get(Acquisition, acquisition_id) is None:
             raise not_found(acquisition_id)
-        rows = session.scalars(
-            sa.select(StoredFile).where(StoredFile.acquisition_id == acquisition_id).order_by(StoredFile.id)
-        )
-        return [File.model_validate(row) for row in rows]
+        rows = session.scalars(paged(query, StoredFile.id, after, limit, sort))
+        files = [File.model_validate(row) for row in rows]
+    return listed(request, response, files, [file.id for file in files], limit)
 
 
-@router.get("/acquisitions/{acquisition_id}/files/{file_id}")
+@router.get("/acquisitions/{acquisition_id}/files/{file_id}", operation_id="files.get")
 def get_file(context: Context, principal: Reader, acquisition_id: AcquisitionId, file_id: FileId) -> File:
     """Return one file."""
     with context.database.session() as session:
@@ -46,7 +61,8 @@ def get_file(context: Context, principal: Reader, acquisition_id: AcquisitionId,
 @router.get(
     "/acquisitions/{acquisition_id}/files/{file_id}/content",
     response_class=Response,
-    responses={200: {"content": {"application/octet-stream": {}}}, 206: {"content": {"application/octet-stream": {}}}},
+    responses={200: BYTES, 206: BYTES},
+    operation_id="files.get_content",
 )
 def get_content(
     context: Context, principal: Reader, request: Request, acquisition_id: AcquisitionId, file_id: FileId
@@ -58,7 +74,7 @@ def get_content(
     return ranged_response(request, context.storage, row.storage_key, kind or "application/octet-stream", row.label)
 
 
-@router.delete("/acquisitions/{acquisition_id}/files/{file_id}", status_code=204)
+@router.delete("/acquisitions/{acquisition_id}/files/{file_id}", status_code=204, operation_id="files.delete")
 def delete_file(context: Context, principal: Uploader, acquisition_id: AcquisitionId, file_id: FileId) -> None:
     """Delete a file, to send a better one. Refused while a job works on the acquisition."""
     with context.database.session() as session:

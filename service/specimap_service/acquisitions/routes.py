@@ -6,7 +6,7 @@ import datetime
 from typing import Annotated, cast, get_args
 
 import sqlalchemy as sa
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, Query, Response
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, StringConstraints
 from sqlalchemy.orm import Session
 
@@ -20,13 +20,14 @@ from specimap_infra.tables import FINAL_STATES, Acquisition, Job, StoredFile, Up
 from specimap_service.acquisitions.capacity import locked_acquisition
 from specimap_service.acquisitions.dependencies import JudgeDep, UnfinishedUploadsDep
 from specimap_service.acquisitions.schemas import FileCounts, counts
-from specimap_service.auth.access import in_sight, not_found
+from specimap_service.auth.access import in_sight, load, not_found
 from specimap_service.auth.dependencies import Admin, Reader, Uploader
 from specimap_service.auth.object_ids import AcquisitionId
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import Context, audit
+from specimap_service.idempotency import IdempotencyKey, Repeatable, repeated
 from specimap_service.jobs.deletion import JobFiles
-from specimap_service.paging import After, InProject, Limit, Moment, Page, page_of
+from specimap_service.paging import After, CreatedAfter, CreatedBefore, InProject, Limit, Page, Sort, page_of, paged
 
 router = APIRouter(prefix="/v1", tags=["acquisitions"])
 PSEUDONYM = r"^[A-Za-z0-9._-]{1,64}$"
@@ -75,42 +76,57 @@ class AcquisitionView(BaseModel):
     missing: list[str] = Field(description="What is still needed, a sentence each.")
 
 
-@router.post("/acquisitions", status_code=201)
+@router.post("/acquisitions", status_code=201, responses=repeated(AcquisitionView), operation_id="acquisitions.create")
 def create_acquisition(
-    context: Context, principal: Uploader, judge: JudgeDep, wanted: AcquisitionRequest
+    context: Context,
+    principal: Uploader,
+    judge: JudgeDep,
+    response: Response,
+    wanted: AcquisitionRequest,
+    idempotency_key: IdempotencyKey = None,
 ) -> AcquisitionView:
     """Create an acquisition; then upload its photos and its cube."""
-    row = Acquisition(
-        id=new_id("acq"),
-        project_id=principal.project_id,
-        created_by=principal.key_id,
-        created_at=utc_now(),
-        **wanted.model_dump(),
-    )
-    with context.database.session() as session:
+
+    def make(session: Session, _: str) -> tuple[str, AcquisitionView]:
+        row = Acquisition(
+            id=new_id("acq"),
+            project_id=principal.project_id,
+            created_by=principal.key_id,
+            created_at=utc_now(),
+            **wanted.model_dump(),
+        )
         session.add(row)
         audit(session, principal.key_id, "acquisition.create", row.id)
         session.flush()
-        view = _view(session, row)
+        return row.id, _view(session, row)
+
+    def again(session: Session, acquisition_id: str, _: str) -> AcquisitionView:
+        return _view(session, load(session, principal, Acquisition, acquisition_id))
+
+    request = Repeatable.of(principal, idempotency_key, "acquisitions.create", wanted.model_dump(mode="json"))
+    view, new = request.once(context.database, make, again)
     judge.warm()
+    response.status_code = 201 if new else 200
     return view
 
 
-@router.get("/acquisitions")
+@router.get("/acquisitions", operation_id="acquisitions.list")
 def list_acquisitions(
     context: Context,
     principal: Reader,
-    specimen_id: Annotated[str | None, Query(max_length=64)] = None,
-    accession_number: Annotated[str | None, Query(max_length=64)] = None,
-    created_after: Annotated[Moment | None, Query(description="Only those created at this time or later.")] = None,
-    created_before: Annotated[Moment | None, Query(description="Only those created before this time.")] = None,
+    specimen_id: Annotated[str | None, Query(max_length=64, description="Only those of this specimen.")] = None,
+    accession_number: Annotated[
+        str | None, Query(max_length=64, description="Only those with this accession number.")
+    ] = None,
+    created_after: CreatedAfter = None,
+    created_before: CreatedBefore = None,
     project: InProject = None,
     after: After = None,
     limit: Limit = 50,
+    sort: Sort = "-created_at",
 ) -> Page[AcquisitionView]:
-    """List acquisitions, newest first."""
+    """List acquisitions."""
     query = sa.select(Acquisition).where(in_sight(principal, Acquisition, project))
-    query = query.order_by(Acquisition.id.desc()).limit(limit + 1)
     for column, value in ((Acquisition.specimen_id, specimen_id), (Acquisition.accession_number, accession_number)):
         if value is not None:
             query = query.where(column == value)
@@ -118,15 +134,14 @@ def list_acquisitions(
         query = query.where(Acquisition.created_at >= created_after)
     if created_before is not None:
         query = query.where(Acquisition.created_at < created_before)
-    if after is not None:
-        query = query.where(Acquisition.id < after)
+    query = paged(query, Acquisition.id, after, limit, sort)
     with context.database.session() as session:
         rows = list(session.scalars(query))
         views = [_view(session, row) for row in rows]
     return page_of(views, [row.id for row in rows], limit)
 
 
-@router.get("/acquisitions/{acquisition_id}")
+@router.get("/acquisitions/{acquisition_id}", operation_id="acquisitions.get")
 def get_acquisition(context: Context, principal: Reader, acquisition_id: AcquisitionId) -> AcquisitionView:
     """Return one acquisition."""
     with context.database.session() as session:
@@ -136,7 +151,7 @@ def get_acquisition(context: Context, principal: Reader, acquisition_id: Acquisi
         return _view(session, row)
 
 
-@router.delete("/acquisitions/{acquisition_id}", status_code=204)
+@router.delete("/acquisitions/{acquisition_id}", status_code=204, operation_id="acquisitions.delete")
 def delete_acquisition(
     context: Context,
     principal: Admin,

@@ -70,34 +70,7 @@ Judgement = Annotated[PhotoJudgement | CubeJudgement, Field(discriminator="kind"
 class File(BaseModel):
     """A file of an acquisition."""
 
-    model_config = ConfigDict(
-        from_attributes=True,
-        json_schema_extra={
-            "example": {
-                "id": "file_01k0000000000000000000000",
-                "role": "photo",
-                "label": "photo-0001.jpg",
-                "name": "IMG_1.jpg",
-                "size": 2481273,
-                "sha256": "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08",
-                "state": "accepted",
-                "created_at": "2026-11-22T09:30:00Z",
-                "judgement": {
-                    "kind": "photo",
-                    "verdict": "doubtful",
-                    "code": "photo_blurred",
-                    "reason": "It is shaken.",
-                    "advice": "Take it again: hold still and tap on the specimen to focus.",
-                    "width": 4000,
-                    "height": 3000,
-                    "sharpness": 0.0021,
-                    "marker_ids": [0, 1, 3],
-                    "dictionary_seen": None,
-                    "same_as": None,
-                },
-            }
-        },
-    )
+    model_config = ConfigDict(from_attributes=True)
 
     id: str
     role: Role

@@ -14,9 +14,9 @@ from specimap_infra.errors import DatabaseUnavailableError
 from specimap_service.app_state import AppState
 from specimap_service.auth.access import Access
 from specimap_service.auth.keys import KEPT_SECONDS, Keyring, Principal
-from specimap_service.auth.rate_limit import RateLimiter
-from specimap_service.context import AppContext
-from specimap_service.errors import ForbiddenError, UnauthorizedError
+from specimap_service.auth.rate_limit import Left, RateLimiter
+from specimap_service.context import ANSWER_HEADERS, AppContext
+from specimap_service.errors import ForbiddenError, RateLimitedError, UnauthorizedError
 from specimap_service.feature import Feature
 
 FAILURES_PER_MINUTE = 60
@@ -48,7 +48,7 @@ async def authenticated(request: Request) -> Principal:
         DatabaseUnavailableError: keys cannot be looked up.
     """
     keyring, limiter = KEYRING.of(request.app), LIMITER.of(request.app)
-    key = _key_of(request)
+    key = key_of(request)
     try:
         found = keyring.trusted(key)
         if found is None:
@@ -58,12 +58,19 @@ async def authenticated(request: Request) -> Principal:
         address = request.client.host if request.client else "unknown"
         limiter.take(f"address:{address}", FAILURES_PER_MINUTE)
         raise
-    limiter.take(found.key_id, found.rate_per_minute)
+    try:
+        left = limiter.take(found.key_id, found.rate_per_minute)
+    except RateLimitedError as error:
+        left = Left(found.rate_per_minute, 0, error.details["retry_after_s"])
+        raise
+    finally:
+        request.scope.get(ANSWER_HEADERS, {}).update(left.headers())
     structlog.contextvars.bind_contextvars(key=found.key_id)
     return found
 
 
-def _key_of(request: Request) -> str:
+def key_of(request: Request) -> str:
+    """Return the key that a request presents. Raises UnauthorizedError where there is none."""
     kind, _, key = request.headers.get("authorization", "").partition(" ")
     if kind.lower() != "bearer" or not key.strip():
         raise UnauthorizedError("There is no key.", advice="Send it as `Authorization: Bearer <key>`.")
@@ -73,7 +80,7 @@ def _key_of(request: Request) -> str:
 def trust_of(request: Request) -> Callable[[], Awaitable[float | None]]:
     """Make a check for answers that last: the seconds for which the request's key is trusted, None where it no longer
     is. A key that cannot be looked up keeps its trust."""
-    keyring, key = KEYRING.of(request.app), _key_of(request)
+    keyring, key = KEYRING.of(request.app), key_of(request)
 
     async def seconds() -> float | None:
         left = keyring.trusted_seconds(key)
@@ -105,6 +112,10 @@ async def known_principal(
 Known = Annotated[Principal, Depends(known_principal)]
 
 
+SCOPE_OF: dict[Callable[..., object], str] = {}
+"""The scope that each dependency made by :func:`requires` asks for, from which the API's description takes it."""
+
+
 def requires(scope: str) -> Callable[..., Awaitable[Principal]]:
     """Make a dependency: the request's principal, if its key has the scope. ``admin`` has all."""
 
@@ -113,6 +124,7 @@ def requires(scope: str) -> Callable[..., Awaitable[Principal]]:
             raise ForbiddenError(f"The key lacks the scope {scope!r}.", advice="Use a key that has it.", scope=scope)
         return found
 
+    SCOPE_OF[principal] = scope
     return principal
 
 

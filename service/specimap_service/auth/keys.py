@@ -50,9 +50,10 @@ def new_key(
     expires_at: datetime.datetime | None = None,
     rate_per_minute: int | None = None,
     quota_bytes: int | None = None,
+    secret: str | None = None,
 ) -> tuple[ApiKey, str]:
-    """Make a row to store, and the key itself, which is kept nowhere."""
-    row_id, secret = new_id("key"), secrets.token_hex(32)
+    """Make a row to store, and the key itself, which is kept nowhere. ``secret``: 64 hexadecimal digits, or random."""
+    row_id, secret = new_id("key"), secret or secrets.token_hex(32)
     row = ApiKey(
         id=row_id,
         project_id=project_id,
@@ -64,7 +65,20 @@ def new_key(
         rate_per_minute=rate_per_minute,
         quota_bytes=quota_bytes,
     )
-    return row, f"{PREFIX}_{row_id.removeprefix('key_')}_{secret}"
+    return row, key_text(row_id, secret)
+
+
+def key_text(row_id: str, secret: str) -> str:
+    """Write a key."""
+    return f"{PREFIX}_{row_id.removeprefix('key_')}_{secret}"
+
+
+def derived_secret(key: str, salt: str) -> str:
+    """Return the secret of a key that another key makes, the same for the same salt.
+
+    Neither what the database keeps nor the other key alone gives it: the salt goes when the request is kept no longer.
+    """
+    return hmac.new(key.encode(), salt.encode(), hashlib.sha256).hexdigest()
 
 
 def _hash(secret: str) -> str:

@@ -2,14 +2,32 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from specimap_service.errors import RateLimitedError
 
 MOST_BUCKETS = 10_000
+
+
+@dataclass(frozen=True)
+class Left:
+    """Requests that are left of ``per_minute``; after ``full_s`` seconds all are there again."""
+
+    per_minute: int
+    requests: int
+    full_s: int
+
+    def headers(self) -> dict[str, str]:
+        """Return the fields of the IETF's draft-ietf-httpapi-ratelimit-headers."""
+        return {
+            "RateLimit-Policy": f'"key";q={self.per_minute};w=60',
+            "RateLimit": f'"key";r={self.requests};t={self.full_s}',
+        }
 
 
 class RateLimiter:
@@ -20,8 +38,8 @@ class RateLimiter:
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
         self._lock = threading.Lock()
 
-    def take(self, name: str, per_minute: int) -> None:
-        """Count one request of ``name``.
+    def take(self, name: str, per_minute: int) -> Left:
+        """Count one request of ``name``; return how many are left.
 
         Raises:
             RateLimitedError: the bucket is empty; details say when it will not be.
@@ -37,5 +55,8 @@ class RateLimiter:
         if not allowed:
             wait = max(1, round((1 - left) * 60 / per_minute))
             raise RateLimitedError(
-                f"More than {per_minute} requests a minute.", advice=f"Wait {wait} s.", retry_after_s=wait
+                f"More than {per_minute} requests a minute.",
+                advice=f"Wait {wait} s.",
+                retry_after_s=wait,
             )
+        return Left(per_minute, int(left - 1), math.ceil((per_minute - left + 1) * 60 / per_minute))

@@ -6,19 +6,21 @@ import datetime
 from typing import Annotated, Any, Literal
 
 import sqlalchemy as sa
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
+from sqlalchemy.orm import Session
 
 from specimap_infra.database import utc_now
 from specimap_infra.projects import found_project
 from specimap_infra.tables import ApiKey, AuditEntry
 from specimap_service.auth.access import in_sight, load
-from specimap_service.auth.dependencies import Admin, KeyringDep
-from specimap_service.auth.keys import new_key
+from specimap_service.auth.dependencies import Admin, KeyringDep, key_of
+from specimap_service.auth.keys import derived_secret, key_text, new_key
 from specimap_service.auth.object_ids import KeyId
 from specimap_service.context import Context, audit
 from specimap_service.errors import RequestInvalidError
-from specimap_service.paging import InProject, Limit, Moment, Page, page_of
+from specimap_service.idempotency import IdempotencyKey, Repeatable, repeated
+from specimap_service.paging import After, InProject, Limit, MaybeLimit, Moment, Page, Sort, listed, page_of, paged
 
 router = APIRouter(prefix="/v1", tags=["keys"])
 
@@ -63,13 +65,15 @@ class Key(BaseModel):
 class NewKey(Key):
     """A key that was just created."""
 
-    key: str = Field(description="The key itself; it is shown this once and kept nowhere.")
+    key: str = Field(
+        description="The key itself; it is shown this once, or again for the same Idempotency-Key, and kept nowhere."
+    )
 
 
 class Audited(BaseModel):
     """An entry of the audit trail: which key did what to which object."""
 
-    model_config = ConfigDict(from_attributes=True)
+    model_config = ConfigDict(title="AuditEntry", from_attributes=True)
 
     id: int
     at: datetime.datetime
@@ -81,8 +85,15 @@ class Audited(BaseModel):
     correlation_id: str
 
 
-@router.post("/keys", status_code=201)
-def create_key(context: Context, principal: Admin, wanted: KeyRequest) -> NewKey:
+@router.post("/keys", status_code=201, responses=repeated(NewKey), operation_id="keys.create")
+def create_key(
+    context: Context,
+    principal: Admin,
+    request: Request,
+    response: Response,
+    wanted: KeyRequest,
+    idempotency_key: IdempotencyKey = None,
+) -> NewKey:
     """Create a key."""
     if wanted.expires_at is not None and wanted.expires_at <= utc_now():
         raise RequestInvalidError(
@@ -90,7 +101,9 @@ def create_key(context: Context, principal: Admin, wanted: KeyRequest) -> NewKey
             advice="Give a later time, with its zone.",
             fields=[{"where": "body.expires_at", "what": "the time has passed"}],
         )
-    with context.database.session() as session:
+    own = key_of(request)
+
+    def make(session: Session, salt: str) -> tuple[str, NewKey]:
         project_id = principal.project_id if wanted.project is None else found_project(session, wanted.project).id
         row, key = new_key(
             wanted.name,
@@ -99,21 +112,41 @@ def create_key(context: Context, principal: Admin, wanted: KeyRequest) -> NewKey
             expires_at=wanted.expires_at,
             rate_per_minute=wanted.rate_per_minute,
             quota_bytes=wanted.quota_bytes,
+            secret=None if idempotency_key is None else derived_secret(own, salt),
         )
         session.add(row)
         audit(session, principal.key_id, "key.create", row.id, scopes=row.scopes)
-    return NewKey(**Key.model_validate(row).model_dump(), key=key)
+        return row.id, NewKey(**Key.model_validate(row).model_dump(), key=key)
+
+    def again(session: Session, key_id: str, salt: str) -> NewKey:
+        row = load(session, principal, ApiKey, key_id)
+        return NewKey(**Key.model_validate(row).model_dump(), key=key_text(key_id, derived_secret(own, salt)))
+
+    repeatable = Repeatable.of(principal, idempotency_key, "keys.create", wanted.model_dump(mode="json"))
+    key, new = repeatable.once(context.database, make, again)
+    response.status_code = 201 if new else 200
+    return key
 
 
-@router.get("/keys")
-def list_keys(context: Context, principal: Admin, project: InProject = None) -> list[Key]:
-    """List all keys, revoked ones too."""
-    query = sa.select(ApiKey).where(in_sight(principal, ApiKey, project)).order_by(ApiKey.id)
+@router.get("/keys", operation_id="keys.list")
+def list_keys(
+    context: Context,
+    principal: Admin,
+    request: Request,
+    response: Response,
+    project: InProject = None,
+    after: After = None,
+    limit: MaybeLimit = None,
+    sort: Sort = "created_at",
+) -> list[Key]:
+    """List the keys, revoked ones too."""
+    query = paged(sa.select(ApiKey).where(in_sight(principal, ApiKey, project)), ApiKey.id, after, limit, sort)
     with context.database.session() as session:
-        return [Key.model_validate(row) for row in session.scalars(query)]
+        keys = [Key.model_validate(row) for row in session.scalars(query)]
+    return listed(request, response, keys, [key.id for key in keys], limit)
 
 
-@router.delete("/keys/{key_id}", status_code=204)
+@router.delete("/keys/{key_id}", status_code=204, operation_id="keys.revoke")
 def revoke_key(context: Context, principal: Admin, keyring: KeyringDep, key_id: KeyId) -> None:
     """Revoke a key; it is refused within two seconds everywhere."""
     with context.database.session() as session:
@@ -123,7 +156,7 @@ def revoke_key(context: Context, principal: Admin, keyring: KeyringDep, key_id: 
     keyring.forget()
 
 
-@router.get("/audit")
+@router.get("/audit", operation_id="audit.list")
 def list_audit(
     context: Context,
     principal: Admin,
@@ -133,18 +166,13 @@ def list_audit(
     project: InProject = None,
     after: Annotated[int | None, Query(ge=1, description="`next` of the page before.")] = None,
     limit: Limit = 100,
+    sort: Sort = "-created_at",
 ) -> Page[Audited]:
-    """List the audit trail, newest entry first."""
-    query = (
-        sa.select(AuditEntry)
-        .where(in_sight(principal, AuditEntry, project))
-        .order_by(AuditEntry.id.desc())
-        .limit(limit + 1)
-    )
+    """List the audit trail."""
+    query = sa.select(AuditEntry).where(in_sight(principal, AuditEntry, project))
     if target is not None:
         query = query.where(AuditEntry.target == target)
-    if after is not None:
-        query = query.where(AuditEntry.id < after)
+    query = paged(query, AuditEntry.id, after, limit, sort)
     with context.database.session() as session:
         rows = list(session.scalars(query))
     return page_of([Audited.model_validate(row) for row in rows], [str(row.id) for row in rows], limit)

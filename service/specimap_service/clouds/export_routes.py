@@ -8,6 +8,7 @@ from typing import Any
 import sqlalchemy as sa
 from fastapi import APIRouter, Request, Response
 from pydantic import BaseModel, Field
+from sqlalchemy.orm import Session
 
 from specimap_core.errors import NotFoundError
 from specimap_core.export.formats import KINDS, FileFormat, file_name
@@ -18,11 +19,14 @@ from specimap_infra.labels import current_labels, fingerprint, lock_cloud
 from specimap_infra.queue import EXPORTS, MAKE_EXPORT, enqueue
 from specimap_infra.tables import PRIORITIES
 from specimap_service.auth.dependencies import Reader
+from specimap_service.auth.keys import Principal
 from specimap_service.auth.object_ids import CloudId
 from specimap_service.byte_ranges import REVALIDATED, ranged_response
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.clouds.open_clouds import CloudRecord
 from specimap_service.context import AppContext, Context, audit, correlation_id
+from specimap_service.idempotency import IdempotencyKey, Repeatable
+from specimap_service.paging import After, MaybeLimit, Sort, listed, part_of
 
 router = APIRouter(prefix="/v1/clouds/{cloud_id}/exports", tags=["exports"])
 
@@ -44,9 +48,16 @@ class Export(BaseModel):
     "/{format}",
     status_code=202,
     responses={200: {"model": Export, "description": "The file exists already."}},
+    operation_id="exports.create",
 )
 def create_export(
-    context: Context, principal: Reader, clouds: CloudsDep, response: Response, cloud_id: CloudId, format: FileFormat
+    context: Context,
+    principal: Reader,
+    clouds: CloudsDep,
+    response: Response,
+    cloud_id: CloudId,
+    format: FileFormat,
+    idempotency_key: IdempotencyKey = None,
 ) -> Export:
     """Have a file made, once for each format; asked again, return its state.
 
@@ -59,52 +70,84 @@ def create_export(
         response.status_code = 200
         return _mesh_ply(context, cloud)
     replaced: str | None = None
-    with context.database.session() as session:
-        lock_cloud(session, cloud_id)
-        row = session.scalar(_query(cloud_id, format))
-        if row is not None and (
-            row.state in ("failed", "cancelled")
-            or (
-                row.state == "succeeded"
-                and format is FileFormat.ZARR
-                and row.labels_hash != fingerprint(current_labels(session, cloud_id))
-            )
-        ):
-            replaced = row.id
-            session.delete(row)
-            session.flush()
-            row = None
+
+    def make(session: Session, _: str) -> tuple[str, tables.Export]:
+        nonlocal replaced
+        row, replaced = _made(context, session, principal, cloud_id, format)
+        return row.id, row
+
+    def again(session: Session, export_id: str, _: str) -> tables.Export:
+        row = session.get(tables.Export, export_id)
         if row is None:
-            row = tables.Export(
-                id=new_id("exp"),
-                cloud_id=cloud_id,
-                format=format.value,
-                state="queued",
-                correlation_id=correlation_id(),
-                created_by=principal.key_id,
-            )
-            session.add(row)
-            session.flush()
-            priority = PRIORITIES["routine"]
-            enqueue(context.queue, session.connection(), EXPORTS, MAKE_EXPORT, row.id, priority)
-            audit(session, principal.key_id, "export.create", row.id, cloud=cloud_id, format=format.value)
+            raise _no_export(cloud_id, format)
+        return row
+
+    request = Repeatable.of(principal, idempotency_key, "exports.create", {"cloud": cloud_id, "format": format.value})
+    row, _ = request.once(context.database, make, again)
     if replaced is not None:
         context.storage.delete(f"exports/{replaced}")
     response.status_code = 200 if row.state == "succeeded" else 202
     return _view(row)
 
 
-@router.get("")
-def list_exports(context: Context, principal: Reader, clouds: CloudsDep, cloud_id: CloudId) -> list[Export]:
+def _made(
+    context: AppContext, session: Session, principal: Principal, cloud_id: str, format: FileFormat
+) -> tuple[tables.Export, str | None]:
+    """Return the row of an export, new where there is none of use, and the id of the one that it replaces."""
+    replaced: str | None = None
+    lock_cloud(session, cloud_id)
+    row = session.scalar(_query(cloud_id, format))
+    if row is not None and (
+        row.state in ("failed", "cancelled")
+        or (
+            row.state == "succeeded"
+            and format is FileFormat.ZARR
+            and row.labels_hash != fingerprint(current_labels(session, cloud_id))
+        )
+    ):
+        replaced = row.id
+        session.delete(row)
+        session.flush()
+        row = None
+    if row is None:
+        row = tables.Export(
+            id=new_id("exp"),
+            cloud_id=cloud_id,
+            format=format.value,
+            state="queued",
+            correlation_id=correlation_id(),
+            created_by=principal.key_id,
+        )
+        session.add(row)
+        session.flush()
+        enqueue(context.queue, session.connection(), EXPORTS, MAKE_EXPORT, row.id, PRIORITIES["routine"])
+        audit(session, principal.key_id, "export.create", row.id, cloud=cloud_id, format=format.value)
+    return row, replaced
+
+
+@router.get("", operation_id="exports.list")
+def list_exports(
+    context: Context,
+    principal: Reader,
+    clouds: CloudsDep,
+    request: Request,
+    response: Response,
+    cloud_id: CloudId,
+    after: After = None,
+    limit: MaybeLimit = None,
+    sort: Sort = "-created_at",
+) -> list[Export]:
     """List the files that exist or are being made; `mesh-ply` always exists."""
     cloud = clouds.record(cloud_id)
-    query = sa.select(tables.Export).where(tables.Export.cloud_id == cloud_id).order_by(tables.Export.id.desc())
+    query = sa.select(tables.Export).where(tables.Export.cloud_id == cloud_id)
     with context.database.session() as session:
-        rows = list(session.scalars(query))
-    return [*map(_view, rows), _mesh_ply(context, cloud)]
+        exports = [_mesh_ply(context, cloud), *map(_view, session.scalars(query))]
+    # The mesh is as old as the cloud, so its place is among the others.
+    exports = part_of(exports, lambda export: export.id, after, limit, sort)
+    return listed(request, response, exports, [export.id for export in exports], limit)
 
 
-@router.get("/{format}")
+@router.get("/{format}", operation_id="exports.get")
 def get_export(context: Context, principal: Reader, clouds: CloudsDep, cloud_id: CloudId, format: FileFormat) -> Export:
     """Return the state of a file."""
     cloud = clouds.record(cloud_id)
@@ -126,8 +169,8 @@ FILE: dict[int | str, dict[str, Any]] = {
 }
 
 
-@router.head("/{format}/content", response_class=Response, responses=FILE, operation_id="head_export_content")
-@router.get("/{format}/content", response_class=Response, responses=FILE)
+@router.head("/{format}/content", response_class=Response, responses=FILE, operation_id="exports.head_content")
+@router.get("/{format}/content", response_class=Response, responses=FILE, operation_id="exports.get_content")
 def get_content(
     context: Context, principal: Reader, clouds: CloudsDep, request: Request, cloud_id: CloudId, format: FileFormat
 ) -> Response:
@@ -158,10 +201,14 @@ def _found(context: AppContext, cloud_id: str, format: FileFormat) -> tables.Exp
     with context.database.session() as session:
         row = session.scalar(_query(cloud_id, format))
     if row is None:
-        raise NotFoundError(
-            f"There is no export of {cloud_id} as {format.value}.", advice="POST to the same address has it made."
-        )
+        raise _no_export(cloud_id, format)
     return row
+
+
+def _no_export(cloud_id: str, format: FileFormat) -> NotFoundError:
+    return NotFoundError(
+        f"There is no export of {cloud_id} as {format.value}.", advice="POST to the same address has it made."
+    )
 
 
 def _mesh_key(cloud: CloudRecord) -> str:

@@ -7,7 +7,7 @@ import io
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path as FilePath
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 from uuid import uuid4
 
 import numpy as np
@@ -50,11 +50,15 @@ from specimap_service.clouds.label_store import Conditions, check_room, delete_l
 from specimap_service.clouds.open_clouds import LabelRecord, OpenClouds
 from specimap_service.context import AppContext, Context
 from specimap_service.errors import MediaTypeError, PayloadTooLargeError
+from specimap_service.paging import MaybeLimit, Sort, listed, part_of
 from specimap_service.space import DISK_EVERY, check_disks
 
 router = APIRouter(prefix="/v1", tags=["labels"])
 LabelName = Annotated[str, Path(pattern=r"^[a-z0-9_-]{1,64}$")]
 Version = Annotated[int | None, Query(ge=1, le=10**9, description="By default the current version.")]
+AfterName = Annotated[str | None, Query(pattern=r"^[a-z0-9_-]{1,64}$", description="Name of the last one seen.")]
+AfterVersion = Annotated[int | None, Query(ge=1, le=10**9, description="Number of the last version seen.")]
+SortByName = Annotated[Literal["name", "-name"], Query(description="By name, forwards or backwards.")]
 _BLOCK = 65536
 _SENT_TOGETHER = 1024 * 1024
 
@@ -97,6 +101,7 @@ BINARY = {"schema": {"type": "string", "format": "binary"}}
     status_code=201,
     responses={200: {"model": Label, "description": "The current version is the same; nothing was changed."}},
     openapi_extra={"requestBody": {"required": True, "content": {ARROW: BINARY, NPY: BINARY}}},
+    operation_id="labels.put",
 )
 async def put(
     context: Context,
@@ -172,15 +177,27 @@ def _append(target: FilePath, data: bytes) -> None:
         file.write(data)
 
 
-@router.get("/clouds/{cloud_id}/labels")
-def list_labels(context: Context, principal: Reader, clouds: CloudsDep, cloud_id: CloudId) -> list[Label]:
-    """List the current version of each layer, by name."""
+@router.get("/clouds/{cloud_id}/labels", operation_id="labels.list")
+def list_labels(
+    context: Context,
+    principal: Reader,
+    clouds: CloudsDep,
+    request: Request,
+    response: Response,
+    cloud_id: CloudId,
+    after: AfterName = None,
+    limit: MaybeLimit = None,
+    sort: SortByName = "name",
+) -> list[Label]:
+    """List the current version of each layer."""
     clouds.record(cloud_id)
     with context.database.session() as session:
-        return [_view(row) for row in current_labels(session, cloud_id)]
+        labels = list(map(_view, current_labels(session, cloud_id)))
+    labels = part_of(labels, lambda label: label.name, after, limit, sort)
+    return listed(request, response, labels, [label.name for label in labels], limit)
 
 
-@router.get("/clouds/{cloud_id}/labels/{name}")
+@router.get("/clouds/{cloud_id}/labels/{name}", operation_id="labels.get")
 def get_label(
     context: Context,
     principal: Reader,
@@ -196,21 +213,36 @@ def get_label(
     return _view(row)
 
 
-@router.get("/clouds/{cloud_id}/labels/{name}/versions")
+@router.get("/clouds/{cloud_id}/labels/{name}/versions", operation_id="labels.list_versions")
 def list_versions(
-    context: Context, principal: Reader, clouds: CloudsDep, cloud_id: CloudId, name: LabelName
+    context: Context,
+    principal: Reader,
+    clouds: CloudsDep,
+    request: Request,
+    response: Response,
+    cloud_id: CloudId,
+    name: LabelName,
+    after: AfterVersion = None,
+    limit: MaybeLimit = None,
+    sort: Sort = "-created_at",
 ) -> list[Label]:
-    """List all versions of a layer, newest first."""
+    """List the versions of a layer."""
     clouds.record(cloud_id)
     query = sa.select(LabelVersion).where(LabelVersion.cloud_id == cloud_id, LabelVersion.name == name)
     with context.database.session() as session:
-        rows = list(session.scalars(query.order_by(LabelVersion.version.desc())))
-    if not rows:
+        versions = list(map(_view, session.scalars(query)))
+    if not versions:
         raise no_label(cloud_id, name)
-    return [_view(row) for row in rows]
+    versions = part_of(versions, lambda label: label.version, after, limit, sort)
+    return listed(request, response, versions, [label.version for label in versions], limit)
 
 
-@router.get("/clouds/{cloud_id}/labels/{name}/values", response_model=None, responses=documented_responses(LabelValues))
+@router.get(
+    "/clouds/{cloud_id}/labels/{name}/values",
+    response_model=None,
+    responses=documented_responses(LabelValues),
+    operation_id="labels.get_values",
+)
 def get_values(
     context: Context,
     principal: Reader,
@@ -264,7 +296,7 @@ def _npy(array: PointArray, headers: dict[str, str]) -> Response:
     return StreamingResponse(pieces(), headers={**headers, "Content-Length": str(length)}, media_type=NPY)
 
 
-@router.delete("/clouds/{cloud_id}/labels/{name}", status_code=204)
+@router.delete("/clouds/{cloud_id}/labels/{name}", status_code=204, operation_id="labels.delete")
 def delete(
     context: Context,
     principal: Labeller,

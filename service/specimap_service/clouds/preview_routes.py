@@ -109,7 +109,7 @@ async def previews_of_request(principal: Reader, request: Request, clouds: Cloud
 PreviewsDep = Annotated[Previews, Depends(previews_of_request)]
 
 
-@router.get("/rgb.png", response_class=Response, responses=PNG)
+@router.get("/rgb.png", response_class=Response, responses=PNG, operation_id="previews.get_rgb")
 async def rgb(
     principal: Reader,
     previews: PreviewsDep,
@@ -121,7 +121,7 @@ async def rgb(
     return await previews.picture(cloud_id, grid, size, drawing.rgb, ["rgb"])
 
 
-@router.get("/pca.png", response_class=Response, responses=PNG)
+@router.get("/pca.png", response_class=Response, responses=PNG, operation_id="previews.get_pca")
 async def pca(
     principal: Reader,
     previews: PreviewsDep,
@@ -133,7 +133,7 @@ async def pca(
     return await previews.picture(cloud_id, grid, size, drawing.pca, ["pca"])
 
 
-@router.get("/band.png", response_class=Response, responses=PNG)
+@router.get("/band.png", response_class=Response, responses=PNG, operation_id="previews.get_band")
 async def band(
     principal: Reader,
     previews: PreviewsDep,
@@ -153,7 +153,7 @@ async def band(
     return await previews.picture(cloud_id, grid, size, paint, ["band", chosen, limits])
 
 
-@router.get("/composite.png", response_class=Response, responses=PNG)
+@router.get("/composite.png", response_class=Response, responses=PNG, operation_id="previews.get_composite")
 async def composite(
     principal: Reader,
     previews: PreviewsDep,
@@ -169,7 +169,7 @@ async def composite(
     return await previews.picture(cloud_id, grid, size, paint, ["composite", r, g, b])
 
 
-@router.get("/index.png", response_class=Response, responses=PNG)
+@router.get("/index.png", response_class=Response, responses=PNG, operation_id="previews.get_index")
 async def index(
     principal: Reader,
     previews: PreviewsDep,
@@ -187,7 +187,7 @@ async def index(
     return await previews.picture(cloud_id, grid, size, paint, ["index", a, b, limits])
 
 
-@router.get("/label.png", response_class=Response, responses=PNG)
+@router.get("/label.png", response_class=Response, responses=PNG, operation_id="previews.get_label")
 async def label(
     context: Context,
     principal: Reader,

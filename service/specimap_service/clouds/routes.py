@@ -17,7 +17,7 @@ from specimap_service.auth.object_ids import CloudId
 from specimap_service.byte_ranges import ranged_response
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import Context
-from specimap_service.paging import After, InProject, Limit, Page, page_of
+from specimap_service.paging import After, InProject, Limit, Page, Sort, page_of, paged
 
 router = APIRouter(prefix="/v1", tags=["clouds"])
 
@@ -39,6 +39,8 @@ class CloudSummary(BaseModel):
 class CloudAnswer(CloudSummary):
     """A finished cloud with the metadata of its arrays, and links to everything else."""
 
+    model_config = ConfigDict(title="Cloud")
+
     quantity: str = Field(description="Quantity of decoded spectra: `reflectance`, or `counts`.")
     wavelength_nm: list[float | None] = Field(description="One for each band; null where unknown.")
     bad_bands: list[int] = Field(description="Bands that are useless according to the cube's file or its noise.")
@@ -48,17 +50,18 @@ class CloudAnswer(CloudSummary):
     links: dict[str, str]
 
 
-@router.get("/clouds")
+@router.get("/clouds", operation_id="clouds.list")
 def list_clouds(
     context: Context,
     principal: Reader,
-    acquisition_id: Annotated[str | None, Query(max_length=64)] = None,
-    specimen_id: Annotated[str | None, Query(max_length=200)] = None,
+    acquisition_id: Annotated[str | None, Query(max_length=64, description="Only those of this acquisition.")] = None,
+    specimen_id: Annotated[str | None, Query(max_length=200, description="Only those of this specimen.")] = None,
     project: InProject = None,
     after: After = None,
     limit: Limit = 100,
+    sort: Sort = "-created_at",
 ) -> Page[CloudSummary]:
-    """List finished clouds, newest first."""
+    """List finished clouds."""
     query = sa.select(CloudRow).join(Job, Job.id == CloudRow.job_id).where(Job.state == "succeeded")
     query = query.where(in_sight(principal, CloudRow, project))
     if acquisition_id is not None:
@@ -66,15 +69,13 @@ def list_clouds(
     if specimen_id is not None:
         query = query.join(Acquisition, Acquisition.id == CloudRow.acquisition_id)
         query = query.where(Acquisition.specimen_id == specimen_id)
-    if after is not None:
-        query = query.where(CloudRow.id < after)
-    query = query.order_by(CloudRow.id.desc()).limit(limit + 1).options(sa.orm.defer(CloudRow.report))
+    query = paged(query, CloudRow.id, after, limit, sort).options(sa.orm.defer(CloudRow.report))
     with context.database.session() as session:
         rows = list(session.scalars(query))
     return page_of([CloudSummary.model_validate(row) for row in rows], [row.id for row in rows], limit)
 
 
-@router.get("/clouds/{cloud_id}")
+@router.get("/clouds/{cloud_id}", operation_id="clouds.get")
 def show_cloud(principal: Reader, clouds: CloudsDep, cloud_id: CloudId) -> CloudAnswer:
     """Return one cloud."""
     with clouds.reading(cloud_id) as (record, cloud):
@@ -101,7 +102,10 @@ def show_cloud(principal: Reader, clouds: CloudsDep, cloud_id: CloudId) -> Cloud
 
 
 @router.get(
-    "/clouds/{cloud_id}/corners", response_class=Response, responses={200: {"content": {"application/json": {}}}}
+    "/clouds/{cloud_id}/corners",
+    response_class=Response,
+    responses={200: {"content": {"application/json": {}}}},
+    operation_id="clouds.get_corners",
 )
 def get_corners(
     context: Context, principal: Reader, clouds: CloudsDep, request: Request, cloud_id: CloudId

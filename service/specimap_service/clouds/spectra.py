@@ -133,7 +133,7 @@ class SpectraRequest(_Strict):
         extra="forbid",
         json_schema_extra={
             "example": {
-                "select": {"radius": {"centre": [3.5, -2.0, 4.1], "radius_mm": 1.5}},
+                "select": {"radius": {"centre": [2.0, -3.0, 7.0], "radius_mm": 6}},
                 "bands": {"nm": [500, 700]},
                 "fields": ["xyz", "distance_mm"],
             }
@@ -164,6 +164,8 @@ class SpectraRequest(_Strict):
 
 class SpectraAnswer(BaseModel):
     """One page of a selection. ``indices``, ``spectra`` and ``fields`` have one entry for each point."""
+
+    model_config = ConfigDict(title="Spectra")
 
     total: int = Field(description="Points of the whole selection.")
     offset: int
@@ -196,6 +198,8 @@ class Point(BaseModel):
 
 class BandAnswer(BaseModel):
     """One band of all points, in their order."""
+
+    model_config = ConfigDict(title="Band")
 
     band: int
     wavelength_nm: float | None

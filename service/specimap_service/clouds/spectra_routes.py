@@ -59,7 +59,7 @@ BandList = Annotated[
 Number = Annotated[int, Path(ge=0, lt=2**32)]
 
 
-@router.get("/clouds/{cloud_id}/points/{index}", response_model=Point)
+@router.get("/clouds/{cloud_id}/points/{index}", response_model=Point, operation_id="spectra.get_point")
 def show_point(
     principal: Reader, clouds: CloudsDep, cloud_id: CloudId, index: Number, bands: BandList = None
 ) -> Response:
@@ -108,6 +108,7 @@ async def _wanted(principal: Reader, request: Request, reading: ReadingDep) -> S
     response_model=SpectraAnswer,
     responses=documented_responses(SpectraAnswer),
     openapi_extra=BODY,
+    operation_id="spectra.select",
 )
 async def read_spectra(
     principal: Reader,
@@ -172,7 +173,12 @@ def _page_points(limit: int | None, width: int, *, json: bool) -> int:
     return max(1, min(limit or PAGE, MOST_VALUES // max(width, 1)))
 
 
-@router.get("/clouds/{cloud_id}/bands/{band}", response_model=BandAnswer, responses=documented_responses(BandAnswer))
+@router.get(
+    "/clouds/{cloud_id}/bands/{band}",
+    response_model=BandAnswer,
+    responses=documented_responses(BandAnswer),
+    operation_id="spectra.get_band",
+)
 async def read_band(
     principal: Reader, clouds: CloudsDep, reading: ReadingDep, request: Request, cloud_id: CloudId, band: Number
 ) -> Response:

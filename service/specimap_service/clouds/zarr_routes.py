@@ -35,9 +35,9 @@ _ANSWERS: dict[int | str, dict[str, Any]] = {
 
 
 @router.head(
-    "/clouds/{cloud_id}/zarr/{key:path}", response_class=Response, responses=_ANSWERS, operation_id="head_zarr_file"
+    "/clouds/{cloud_id}/zarr/{key:path}", response_class=Response, responses=_ANSWERS, operation_id="zarr.head"
 )
-@router.get("/clouds/{cloud_id}/zarr/{key:path}", response_class=Response, responses=_ANSWERS)
+@router.get("/clouds/{cloud_id}/zarr/{key:path}", response_class=Response, responses=_ANSWERS, operation_id="zarr.get")
 def zarr_file(
     context: Context,
     principal: Reader,

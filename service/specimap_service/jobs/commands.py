@@ -22,7 +22,8 @@ from specimap_service.auth.access import load, not_found
 from specimap_service.auth.keys import Principal
 from specimap_service.clouds.open_clouds import OpenClouds
 from specimap_service.context import AppContext, audit, correlation_id
-from specimap_service.errors import ForbiddenError, IdempotencyConflictError, UploadIncompleteError
+from specimap_service.errors import ForbiddenError, UploadIncompleteError
+from specimap_service.idempotency import Repeatable
 from specimap_service.jobs.deletion import JobFiles
 from specimap_service.jobs.schemas import JobRequest, RerunRequest, Webhook
 
@@ -93,51 +94,36 @@ def found_job(session: Session, job_id: str) -> Job:
 def _create_once(
     context: AppContext, key_id: str, idempotency_key: str | None, digest: str, row: Callable[[Session], Job]
 ) -> tuple[JobView, bool]:
-    earlier = _find_repeated(context, key_id, idempotency_key, digest)
-    if earlier is not None:
-        return earlier, False
-    try:
-        with context.database.session() as session:
-            job = row(session)
-            missing_files = missing(session, job.acquisition_id)
-            if missing_files:
-                raise UploadIncompleteError(
-                    f"Acquisition {job.acquisition_id} is not complete: {missing_files[0]}",
-                    advice="Upload what is missing, then ask again.",
-                    missing=missing_files,
-                )
-            job.id, job.state, job.created_by = new_id("job"), "queued", key_id
-            job.idempotency_key, job.request_hash, job.correlation_id = idempotency_key, digest, correlation_id()
-            session.add(job)
-            # Now, so that a second request with the same idempotency key fails before it enqueues.
-            session.flush()
-            append_event(session, job.id, "state", {"state": "queued", "starts": 0})
-            enqueue(context.queue, session.connection(), JOBS, RUN_JOB, job.id, job.priority)
-            audit(session, key_id, "job.create", job.id, acquisition=job.acquisition_id, rerun_of=job.rerun_of)
-            (view,) = job_views(session, [job])
-            return view, True
-    except IntegrityError as error:
-        # The same request was made twice at once, or the acquisition was deleted.
-        earlier = _find_repeated(context, key_id, idempotency_key, digest)
-        if earlier is None:
-            raise not_found(job.acquisition_id) from error
-        return earlier, False
+    acquisition_id = ""
 
-
-def _find_repeated(context: AppContext, key_id: str, idempotency_key: str | None, digest: str) -> JobView | None:
-    if idempotency_key is None:
-        return None
-    with context.database.session() as session:
-        job = session.scalar(sa.select(Job).where(Job.created_by == key_id, Job.idempotency_key == idempotency_key))
-        if job is None:
-            return None
-        if job.request_hash != digest:
-            raise IdempotencyConflictError(
-                f"The idempotency key was used for another request, which made {job.id}.",
-                advice="Use a new key for a new request.",
-                job_id=job.id,
+    def make(session: Session, _: str) -> tuple[str, JobView]:
+        nonlocal acquisition_id
+        job = row(session)
+        acquisition_id = job.acquisition_id
+        missing_files = missing(session, job.acquisition_id)
+        if missing_files:
+            raise UploadIncompleteError(
+                f"Acquisition {job.acquisition_id} is not complete: {missing_files[0]}",
+                advice="Upload what is missing, then ask again.",
+                missing=missing_files,
             )
-        return job_views(session, [job])[0]
+        job.id, job.state, job.created_by = new_id("job"), "queued", key_id
+        job.request_hash, job.correlation_id = digest, correlation_id()
+        session.add(job)
+        session.flush()
+        append_event(session, job.id, "state", {"state": "queued", "starts": 0})
+        enqueue(context.queue, session.connection(), JOBS, RUN_JOB, job.id, job.priority)
+        audit(session, key_id, "job.create", job.id, acquisition=job.acquisition_id, rerun_of=job.rerun_of)
+        return job.id, job_views(session, [job])[0]
+
+    def again(session: Session, job_id: str, _: str) -> JobView:
+        return job_views(session, [found_job(session, job_id)])[0]
+
+    try:
+        return Repeatable(key_id, idempotency_key, digest).once(context.database, make, again)
+    except IntegrityError as error:
+        # The acquisition was deleted.
+        raise not_found(acquisition_id) from error
 
 
 def _check_priority(principal: Principal, priority: int) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import aclosing
-from typing import Annotated, Any
+from typing import Annotated
 
 import sqlalchemy as sa
 from fastapi import APIRouter, Query, Request, Response
@@ -23,28 +23,26 @@ from specimap_service.auth.dependencies import Admin, Reader, Uploader, trust_of
 from specimap_service.auth.object_ids import JobId
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import AppContext, Context, audit
+from specimap_service.idempotency import IdempotencyKey, repeated
 from specimap_service.jobs.commands import delete_job, found_job, new_job, repeated_job, stop_workflow
 from specimap_service.jobs.dependencies import EventsDep, StreamPlace
 from specimap_service.jobs.events import Event, position
 from specimap_service.jobs.schemas import (
     AfterJob,
     AfterSeq,
-    IdempotencyKey,
     JobRequest,
     LastEventId,
     LogLine,
     RerunRequest,
 )
-from specimap_service.paging import InProject, Limit, Moment, Page, page_of
+from specimap_service.paging import CreatedAfter, CreatedBefore, InProject, Limit, Page, Sort, page_of, paged
 
 router = APIRouter(prefix="/v1", tags=["jobs"])
 
-REPEATED: dict[int | str, dict[str, Any]] = {
-    200: {"model": JobView, "description": "Created before by the same request"}
-}
+REPEATED = repeated(JobView)
 
 
-@router.post("/jobs", status_code=202, responses=REPEATED)
+@router.post("/jobs", status_code=202, responses=REPEATED, operation_id="jobs.create")
 def create_job(
     context: Context,
     principal: Uploader,
@@ -56,7 +54,7 @@ def create_job(
     return _answer(response, *new_job(context, principal, wanted, idempotency_key))
 
 
-@router.post("/jobs/{job_id}/rerun", status_code=202, responses=REPEATED)
+@router.post("/jobs/{job_id}/rerun", status_code=202, responses=REPEATED, operation_id="jobs.rerun")
 def rerun_job(
     context: Context,
     principal: Uploader,
@@ -75,20 +73,23 @@ def _answer(response: Response, job: JobView, made: bool) -> JobView:
     return job
 
 
-@router.get("/jobs")
+@router.get("/jobs", operation_id="jobs.list")
 def list_jobs(
     context: Context,
     principal: Reader,
-    acquisition_id: Annotated[str | None, Query(pattern=r"^acq_[0-9a-z]{26}$")] = None,
+    acquisition_id: Annotated[
+        str | None, Query(pattern=r"^acq_[0-9a-z]{26}$", description="Only jobs on this one.")
+    ] = None,
     state: Annotated[list[JobState] | None, Query(description="Any of these states.")] = None,
-    created_after: Moment | None = None,
-    created_before: Moment | None = None,
+    created_after: CreatedAfter = None,
+    created_before: CreatedBefore = None,
     project: InProject = None,
     after: AfterJob = None,
     limit: Limit = 100,
+    sort: Sort = "-created_at",
 ) -> Page[JobView]:
-    """List jobs, newest first."""
-    query = sa.select(Job).where(in_sight(principal, Job, project)).order_by(Job.id.desc()).limit(limit + 1)
+    """List jobs."""
+    query = sa.select(Job).where(in_sight(principal, Job, project))
     if acquisition_id is not None:
         query = query.where(Job.acquisition_id == acquisition_id)
     if state:
@@ -97,21 +98,20 @@ def list_jobs(
         query = query.where(Job.created_at >= created_after)
     if created_before is not None:
         query = query.where(Job.created_at < created_before)
-    if after is not None:
-        query = query.where(Job.id < after)
+    query = paged(query, Job.id, after, limit, sort)
     with context.database.session() as session:
         jobs = job_views(session, list(session.scalars(query)))
     return page_of(jobs, [job.id for job in jobs], limit)
 
 
-@router.get("/jobs/{job_id}")
+@router.get("/jobs/{job_id}", operation_id="jobs.get")
 def get_job(context: Context, principal: Reader, job_id: JobId) -> JobView:
     """Return a job as it is now."""
     with context.database.session() as session:
         return job_views(session, [found_job(session, job_id)])[0]
 
 
-@router.post("/jobs/{job_id}/cancel", status_code=202)
+@router.post("/jobs/{job_id}/cancel", status_code=202, operation_id="jobs.cancel")
 def cancel_job(context: Context, principal: Uploader, job_id: JobId) -> JobView:
     """Cancel a job that waits or runs; results of its finished stages are kept for a rerun."""
     with context.database.session() as session:
@@ -124,13 +124,13 @@ def cancel_job(context: Context, principal: Uploader, job_id: JobId) -> JobView:
     return view
 
 
-@router.delete("/jobs/{job_id}", status_code=204)
+@router.delete("/jobs/{job_id}", status_code=204, operation_id="jobs.delete")
 def remove_job(context: Context, principal: Admin, clouds: CloudsDep, job_id: JobId) -> None:
     """Delete a job that has ended, with its result."""
     delete_job(context, clouds, principal.key_id, job_id)
 
 
-@router.get("/jobs/{job_id}/report")
+@router.get("/jobs/{job_id}/report", operation_id="jobs.get_report")
 def get_report(context: Context, principal: Reader, job_id: JobId) -> Report:
     """Return the report on the job's result."""
     with context.database.session() as session:
@@ -147,17 +147,18 @@ def get_report(context: Context, principal: Reader, job_id: JobId) -> Report:
     return Report.model_validate(report)
 
 
-@router.get("/jobs/{job_id}/log")
+@router.get("/jobs/{job_id}/log", operation_id="jobs.get_log")
 def get_log(
-    context: Context, principal: Reader, job_id: JobId, after: AfterSeq = None, limit: Limit = 100
+    context: Context,
+    principal: Reader,
+    job_id: JobId,
+    after: AfterSeq = None,
+    limit: Limit = 100,
+    sort: Sort = "created_at",
 ) -> Page[LogLine]:
-    """Return the job's log, oldest line first."""
-    query = (
-        sa.select(JobEvent)
-        .where(JobEvent.job_id == job_id, JobEvent.type == "log", JobEvent.seq > (after or 0))
-        .order_by(JobEvent.seq)
-        .limit(limit + 1)
-    )
+    """Return the job's log."""
+    query = sa.select(JobEvent).where(JobEvent.job_id == job_id, JobEvent.type == "log")
+    query = paged(query, JobEvent.seq, after, limit, sort)
     with context.database.session() as session:
         found_job(session, job_id)
         lines = [
@@ -174,6 +175,7 @@ def get_log(
         200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}, "description": "Events as they occur"},
         204: {"description": "The job has ended and there is no event after the last one seen: do not reconnect"},
     },
+    operation_id="jobs.follow_events",
 )
 async def follow_events(
     context: Context,

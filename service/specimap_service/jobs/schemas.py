@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 import datetime
-import hashlib
 from typing import Annotated, Any
 
 from fastapi import Header, Query
 from pydantic import BaseModel, ConfigDict, Field
 
-from specimap_core.json_text import json_text
-from specimap_infra.job_schemas import JobSettings, PriorityName
+from specimap_infra.job_schemas import JobFailure, JobSettings, JobState, PriorityName
+from specimap_infra.jobs import Level, Stage
+from specimap_service.idempotency import digest_of
 
 AfterJob = Annotated[str | None, Query(pattern=r"^job_[0-9a-z]{26}$", description="`next` of the page before.")]
 AfterSeq = Annotated[int | None, Query(ge=0, lt=2**31, description="Only events after the one of this number.")]
-IdempotencyKey = Annotated[
-    str | None,
-    Header(
-        pattern=r"^[\x20-\x7e]{1,128}$",
-        description="A name for this request: sent again with the same name, it returns the job created before.",
-    ),
-]
 LastEventId = Annotated[
     str | None, Header(pattern=r"^\d{0,9}$", description="Number of the last event seen; the stream goes on after it.")
 ]
@@ -82,11 +75,6 @@ class RerunRequest(BaseModel):
         return digest_of({"rerun": job_id, **self.model_dump(mode="json", exclude_unset=True)})
 
 
-def digest_of(request: dict[str, Any]) -> str:
-    """Return the SHA-256 of a request's values."""
-    return hashlib.sha256(json_text(request, sort_keys=True).encode()).hexdigest()
-
-
 class LogLine(BaseModel):
     """A line of a job's log."""
 
@@ -95,3 +83,46 @@ class LogLine(BaseModel):
     level: str
     message: str
     data: dict[str, Any]
+
+
+# ---- events -------------------------------------------------------------------------------------------
+
+
+class JobStateEvent(BaseModel):
+    """The job has another state; after a final one there is no event."""
+
+    model_config = ConfigDict(json_schema_extra={"example": {"state": "running", "starts": 1}})
+
+    state: JobState
+    starts: int | None = Field(None, description="How often a worker took it up; left out in a final state.")
+    error: JobFailure | None = Field(None, description="In a final state: why it failed.")
+    cloud_id: str | None = Field(None, description="In a final state: the result, if it succeeded.")
+
+
+class JobProgressEvent(BaseModel):
+    """The stage that runs has come further."""
+
+    model_config = ConfigDict(json_schema_extra={"example": {"stage": "reconstruct", "progress": 0.25}})
+
+    stage: Stage
+    progress: float = Field(ge=0, le=1, description="Share of the stage that is done.")
+
+
+class JobLogEvent(BaseModel):
+    """A line was added to the log."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"example": {"level": "info", "message": "24 photos are used.", "data": {}}}
+    )
+
+    level: Level
+    message: str
+    data: dict[str, Any]
+
+
+EVENT_TYPES: dict[str, type[BaseModel]] = {
+    "state": JobStateEvent,
+    "progress": JobProgressEvent,
+    "log": JobLogEvent,
+}
+"""What each type of event holds, by its name in the stream."""

@@ -46,7 +46,8 @@ FORM: dict[str, Any] = {
                         "sha256": {"type": "string", "description": "Of the next file, in hexadecimal digits."},
                         "file": {"type": "array", "items": {"type": "string", "format": "binary"}},
                     },
-                }
+                },
+                "example": {"role": "photo", "file": ["the bytes of IMG_1.jpg"]},
             }
         },
     }
@@ -89,7 +90,7 @@ def _quota_exceeded(left: int) -> QuotaExceededError:
     )
 
 
-@router.post("/acquisitions/{acquisition_id}/files", status_code=201, openapi_extra=FORM)
+@router.post("/acquisitions/{acquisition_id}/files", status_code=201, openapi_extra=FORM, operation_id="files.create")
 async def add_files(
     context: Context, principal: Uploader, uploads: UploadsDep, request: Request, acquisition_id: AcquisitionId
 ) -> list[File]:

@@ -34,6 +34,7 @@ from specimap_service.auth.keys import Principal
 from specimap_service.context import AppContext, audit
 from specimap_service.errors import ForbiddenError, RequestInvalidError, UploadGoneError
 from specimap_service.fair_turns import FairTurns
+from specimap_service.idempotency import Repeatable
 from specimap_service.space import check_disks, check_quota
 from specimap_service.uploads.files import UploadFiles
 
@@ -53,13 +54,20 @@ class Uploads:
     judge: Judge
     intake: FairTurns
 
-    def create(self, principal: Principal, metadata: Mapping[str, str], size: int | None) -> Upload:
-        """Create an upload after checking that its file fits.
+    def create(
+        self,
+        principal: Principal,
+        metadata: Mapping[str, str],
+        size: int | None,
+        idempotency_key: str | None = None,
+    ) -> Upload:
+        """Create an upload after checking that its file fits, or return the one that the same request created.
 
         Raises:
             RequestInvalidError: the metadata or the length are missing or wrong.
             NotFoundError, JobConflictError: there is no such acquisition; it has this file already.
             PayloadTooLargeError, QuotaExceededError, StorageFullError: it does not fit.
+            IdempotencyConflictError: the idempotency key belongs to another request.
         """
         role, acquisition_id = metadata.get("role", ""), metadata.get("acquisition", "")
         if role not in ROLES:
@@ -89,31 +97,35 @@ class Uploads:
             created_by=principal.key_id,
             expires_at=now + datetime.timedelta(hours=self.context.settings.upload_hours),
         )
+
+        def make(session: Session, _: str) -> tuple[str, Upload]:
+            load(session, principal, Acquisition, acquisition_id)
+            locked_acquisition(session, acquisition_id)
+            if role == "photo":
+                check_count(session, self.context.settings, acquisition_id, 1)
+            else:
+                _check_wanted(session, acquisition_id, role)
+            check_quota(session, principal, size)
+            check_disks(self.context, size, self._expected_bytes(session))
+            session.add(upload)
+            details = {"acquisition": acquisition_id, "role": role, "size": size}
+            audit(session, principal.key_id, "upload.create", upload.id, **details)
+            return upload.id, upload
+
+        def again(session: Session, upload_id: str, _: str) -> Upload:
+            return load(session, principal, Upload, upload_id)
+
+        given = {"acquisition": acquisition_id, "role": role, "name": upload.name, "size": size}
+        request = Repeatable.of(principal, idempotency_key, "uploads.create", given)
         self.files.create(upload.id)
         try:
-            with self.context.database.session() as session:
-                load(session, principal, Acquisition, acquisition_id)
-                locked_acquisition(session, acquisition_id)
-                if role == "photo":
-                    check_count(session, self.context.settings, acquisition_id, 1)
-                else:
-                    _check_wanted(session, acquisition_id, role)
-                check_quota(session, principal, size)
-                check_disks(self.context, size, self._expected_bytes(session))
-                session.add(upload)
-                audit(
-                    session,
-                    principal.key_id,
-                    "upload.create",
-                    upload.id,
-                    acquisition=acquisition_id,
-                    role=role,
-                    size=size,
-                )
+            found, new = request.once(self.context.database, make, again)
         except BaseException:
             self.files.remove(upload.id)
             raise
-        return upload
+        if not new:
+            self.files.remove(upload.id)
+        return found
 
     async def current(self, upload_id: str, principal: Principal) -> Upload:
         """Return the upload as it stands; finish one whose last byte arrived in a process that died.

@@ -6,7 +6,7 @@ from typing import Literal, cast
 
 from fastapi import APIRouter, Response
 from fastapi.concurrency import run_in_threadpool
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from specimap_infra.tables import Upload
 from specimap_service.acquisitions.schemas import File
@@ -24,6 +24,8 @@ State = Literal["open", "finished", "failed", "expired", "terminated"]
 class Failure(BaseModel):
     """The reason why an upload failed."""
 
+    model_config = ConfigDict(title="UploadFailure")
+
     code: str
     message: str
     advice: str
@@ -40,7 +42,7 @@ class UploadResult(BaseModel):
     error: Failure | None = Field(description="The reason, where it failed.")
 
 
-@router.get("/uploads/{upload_id}/result")
+@router.get("/uploads/{upload_id}/result", operation_id="uploads.get_result")
 async def get_result(principal: Uploader, uploads: UploadsDep, upload_id: UploadId) -> UploadResult:
     """Return the state of an upload; for a finished one its file, with the judgement and advice on retaking it."""
     upload = await uploads.current(upload_id, principal)
@@ -60,7 +62,7 @@ def _result(uploads: Uploads, upload: Upload) -> UploadResult:
     )
 
 
-@router.options("/uploads", status_code=204, response_class=Response)
+@router.options("/uploads", status_code=204, response_class=Response, operation_id="uploads.get_options")
 def get_abilities(context: Context, principal: Uploader) -> Response:
     """Return what this tus server supports, in the `Tus-…` headers of the answer."""
     settings = context.settings

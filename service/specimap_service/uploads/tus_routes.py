@@ -17,6 +17,7 @@ from specimap_infra.tables import Upload
 from specimap_service.auth.dependencies import Uploader
 from specimap_service.context import CONTEXT, Context
 from specimap_service.errors import RequestInvalidError
+from specimap_service.idempotency import IdempotencyKey
 from specimap_service.uploads import tus
 from specimap_service.uploads.dependencies import UPLOADS, UploadsDep
 from specimap_service.uploads.files import UploadFiles
@@ -91,12 +92,12 @@ async def _verify_checksum(uploads: UploadsDep, _: Annotated[None, Depends(_chec
 
 
 def _creation_hook(
-    context: Context, uploads: UploadsDep
+    context: Context, uploads: UploadsDep, idempotency_key: IdempotencyKey = None
 ) -> Callable[[dict[str, str], dict[str, Any]], Awaitable[None]]:
     async def create(metadata: dict[str, str], info: dict[str, Any]) -> None:
         exchange = tus.exchange()
         assert exchange.principal is not None
-        upload = await asyncio.to_thread(uploads.create, exchange.principal, metadata, info["size"])
+        upload = await asyncio.to_thread(uploads.create, exchange.principal, metadata, info["size"], idempotency_key)
         exchange.upload = upload
         exchange.headers["Location"] = f"{context.settings.public_url.rstrip('/')}{tus.PREFIX}/{upload.id}"
         exchange.headers["Upload-Expires"] = tus.http_date(upload)
@@ -150,32 +151,54 @@ _BODY: dict[str, Any] = {
 }
 DOCUMENTED: dict[str, dict[str, Any]] = {
     "POST": {
+        "id": "uploads.create",
         "summary": "Create an upload",
         "description": "`Upload-Metadata`: `acquisition` (its id), `role` (photo, cube, white, dark), `filename`, each "
         "with its value in base64. The answer's `Location` takes the bytes. The body is empty.",
         "headers": ("Location", "Upload-Expires"),
     },
     "HEAD": {
+        "id": "uploads.get_offset",
         "summary": "Ask how much has arrived",
         "description": "`Upload-Offset` says where to continue.",
         "headers": ("Upload-Offset", "Upload-Length", "Upload-Metadata"),
     },
     "PATCH": {
+        "id": "uploads.append",
         "summary": "Send bytes",
         "description": "From `Upload-Offset` on; with `Upload-Checksum` (sha1, sha256 or md5, and the digest in "
         "base64) all or nothing: 460 where it differs. The answer to the last byte comes when the file has been "
         "judged, and carries `Specimap-File` and `Specimap-Verdict`; `GET …/result` says more.",
         "headers": ("Upload-Offset", "Upload-Expires", "Specimap-File", "Specimap-Verdict"),
     },
-    "DELETE": {"summary": "End an upload", "description": "Its bytes are removed.", "headers": ()},
+    "DELETE": {
+        "id": "uploads.delete",
+        "summary": "End an upload",
+        "description": "Its bytes are removed.",
+        "headers": (),
+    },
 }
+
+
+NEEDED: dict[str, dict[str, Any]] = {
+    "tus-resumable": {"type": "string", "enum": [tus.VERSION]},
+    "upload-metadata": {"type": "string"},
+    "upload-length": {"type": "integer", "minimum": 1},
+    "upload-offset": {"type": "integer", "minimum": 0},
+}
+"""Headers without which the library's routes that have them refuse."""
+NOT_SERVED: dict[str, tuple[str, ...]] = {
+    "POST": ("upload-concat", "upload-defer-length"),
+    "PATCH": ("upload-length", "post_request"),
+}
+"""Parameters of the library's routes, by method, that belong to extensions which are not served."""
 
 
 def _document(route: APIRoute) -> None:
     method = next(iter(route.methods or ()))
     about = DOCUMENTED[method]
     status = str(route.status_code)
-    route.summary, route.description = about["summary"], about["description"]
+    route.operation_id, route.summary, route.description = about["id"], about["summary"], about["description"]
     route.response_class = Response
     # POST to an address that ends in a slash, as some clients do, is the same.
     route.include_in_schema = not route.path.endswith("/")

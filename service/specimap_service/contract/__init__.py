@@ -1,0 +1,1 @@
+"""The API's description: what FastAPI derives from the routes, with scopes, refusals, examples and events added."""
