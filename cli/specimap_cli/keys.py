@@ -44,11 +44,14 @@ def create(
     with transaction() as session:
         from specimap_infra.database import utc_now
         from specimap_infra.projects import DEFAULT_PROJECT, found_project
-        from specimap_service.auth.keys import new_key
+        from specimap_service.auth.keys import checked_name, new_key
         from specimap_service.context import audit
 
-        if not 1 <= len(name) <= 100:
-            raise SettingsError("A name has 1 to 100 characters.", advice="Give another --name.", setting="name")
+        try:
+            checked_name(name)
+        except ValueError as error:
+            told = f"This is no name of a key: {error}."
+            raise SettingsError(told, advice="Give another --name.", setting="name") from error
         expires_at = None if expires is None else expires.replace(tzinfo=datetime.UTC)
         if expires_at is not None and expires_at <= utc_now():
             raise SettingsError(

@@ -121,7 +121,7 @@ def rename_project(session: Session, project: Project, name: str) -> None:
         SettingsError: the name is not a pseudonym.
         JobConflictError: another project has it.
     """
-    if not re.match(PROJECT_NAME, name):
+    if not re.fullmatch(PROJECT_NAME, name):
         raise SettingsError(
             "A project's name has 1 to 64 letters, digits, dots, dashes and underscores, and does not begin with prj_.",
             advice="Give another name; no patient's.",

@@ -1,4 +1,5 @@
-"""Query parameters that an operation does not know are refused: a misspelt filter would let the whole list through."""
+"""Query parameters that an operation does not know are refused: a misspelt filter would let the whole list through.
+So is NUL in a value, which no stored text has and PostgreSQL takes in none."""
 
 from __future__ import annotations
 
@@ -17,13 +18,14 @@ async def check_query(request: Request) -> None:
     """Check the names in the query: a dependency of all operations, ``async`` so that it takes no thread.
 
     Raises:
-        RequestInvalidError: one is not known, or is given twice where one value counts.
+        RequestInvalidError: one is not known, is given twice where one value counts, or holds NUL.
     """
     route = request.scope.get("route")
     if not request.query_params or not isinstance(route, APIRoute):
         return
     known = known_parameters(route)
     given = [name for name, _ in request.query_params.multi_items()]
+    unreadable = {name for name, value in request.query_params.multi_items() if "\0" in value}
     fields = [
         *({"where": f"query.{name[:100]}", "what": "not known here"} for name in given if name not in known),
         *(
@@ -31,6 +33,7 @@ async def check_query(request: Request) -> None:
             for name, several in known.items()
             if given.count(name) > 1 and not several
         ),
+        *({"where": f"query.{name}", "what": "holds the character NUL"} for name in known if name in unreadable),
     ]
     if fields:
         raise RequestInvalidError(

@@ -75,6 +75,7 @@ def test_projects_are_made_and_keys_are_made_for_them(tmp_path: Path) -> None:
     taken = projects("create", "study-7")
     assert (taken.returncode, taken.stdout) == (2, "")
     assert taken.stderr.startswith("state_conflict: ")
+    assert projects("create", "study-9\n").stderr.startswith("setting_invalid: ")
     assert projects("rename", "study-7", "Anna Muster").stderr.startswith("setting_invalid: ")
     assert projects("rename", "study-7", "study-8").returncode == 0
     rows = [json.loads(line) for line in projects("list", "--json").stdout.splitlines()]
@@ -122,6 +123,8 @@ def test_expiry_and_table(tmp_path: Path) -> None:
         (["create", "--name", "a", "--scope", "root"], "root"),
         (["create", "--name", "a"], "--scope"),
         (["create", "--name", "", "--scope", "read"], "setting_invalid"),
+        (["create", "--name", "a\x1b[31m", "--scope", "read"], "setting_invalid"),
+        (["create", "--name", "a\udcff", "--scope", "read"], "setting_invalid"),
         (["create", "--name", "a", "--scope", "read", "--expires", "2020-01-01"], "has passed"),
         (["create", "--name", "a", "--scope", "read", "--expires", "soon"], "--expires"),
         (["revoke", "key_" + "0" * 26], "not_found"),

@@ -111,6 +111,13 @@ def test_invalid_body_names_the_field(service: Running) -> None:
     assert {field["where"] for field in answer.json()["details"]["fields"]} >= {"body.scopes.0", "body.more"}
 
 
+@pytest.mark.parametrize("name", ["", "a\0b", "a\nb", "a\x1b[31m", "a\u202eb", "a" * 101])
+def test_name_that_does_not_show_as_it_is_is_refused(service: Running, name: str) -> None:
+    answer = service.client().post("/v1/keys", json={"name": name, "scopes": ["read"]})
+    assert (answer.status_code, answer.json()["code"]) == (422, "request_invalid")
+    assert [field["where"] for field in answer.json()["details"]["fields"]] == ["body.name"]
+
+
 def test_metrics_count_requests_and_jobs(service: Running) -> None:
     admin = service.client()
     for _ in range(3):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -174,3 +175,19 @@ def test_a_misspelt_filter_lists_nothing(scene: tuple[Running, Result, dict[str,
     assert "specimen_id" in answer.json()["advice"]
     assert service.client().get("/v1/acquisitions?specimen_id=x").json()["items"] == []
     assert service.client().get("/v1/jobs?state=queued&state=running").status_code == 200
+
+
+def test_what_no_database_takes_is_refused(any_database: str, tmp_path: Path) -> None:
+    wanted = {
+        "acquisitions?specimen_id=a%00": "specimen_id",
+        "acquisitions?accession_number=%00": "accession_number",
+        "clouds?specimen_id=%00": "specimen_id",
+        "clouds?acquisition_id=%00": "acquisition_id",
+        f"audit?after={2**63}": "after",
+    }
+    with serving(tmp_path / "service", database_url=any_database) as service:
+        client = service.client()
+        for address, name in wanted.items():
+            answer = client.get(f"/v1/{address}")
+            assert (answer.status_code, answer.json()["code"]) == (422, "request_invalid"), address
+            assert [field["where"] for field in answer.json()["details"]["fields"]] == [f"query.{name}"]

@@ -239,6 +239,13 @@ def test_location_is_the_public_address(tmp_path: Path) -> None:
         assert answer.headers["Location"].startswith("https://specimap.example/base/v1/uploads/up_")
 
 
+@pytest.mark.parametrize("acquisition", ["SP-1", "acq_1", "acq_\0", "exp_" + "0" * 26, "acq_" + "0" * 26 + "\n"])
+def test_acquisition_that_is_no_id_is_refused(service: Running, acquisition: str) -> None:
+    answer = create(service.client(), acquisition, "photo", 10)
+    assert (answer.status_code, answer.json()["code"]) == (422, "request_invalid")
+    assert answer.json()["details"]["field"] == "acquisition"
+
+
 def test_names_stay_out_of_paths_and_logs(
     service: Running, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:

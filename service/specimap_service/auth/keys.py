@@ -42,6 +42,13 @@ class Principal:
         return self.is_admin or scope in self.scopes
 
 
+def checked_name(name: str) -> str:
+    """Return a key's name. Raises ValueError for one that a terminal or a database would not show as it is."""
+    if not 1 <= len(name) <= 100 or not name.isprintable():
+        raise ValueError("a name has 1 to 100 characters, none of them a control character")
+    return name
+
+
 def new_key(
     name: str,
     scopes: Sequence[str],

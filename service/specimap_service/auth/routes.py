@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import sqlalchemy as sa
 from fastapi import APIRouter, Query, Request, Response
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 
 from specimap_infra.database import utc_now
@@ -15,7 +15,7 @@ from specimap_infra.projects import found_project
 from specimap_infra.tables import ApiKey, AuditEntry
 from specimap_service.auth.access import in_sight, load
 from specimap_service.auth.dependencies import Admin, KeyringDep, key_of
-from specimap_service.auth.keys import derived_secret, key_text, new_key
+from specimap_service.auth.keys import checked_name, derived_secret, key_text, new_key
 from specimap_service.auth.object_ids import KeyId
 from specimap_service.context import Context, audit
 from specimap_service.errors import RequestInvalidError
@@ -33,7 +33,9 @@ class KeyRequest(BaseModel):
         json_schema_extra={"example": {"name": "tablet 3", "scopes": ["upload", "read"], "project": "study-7"}},
     )
 
-    name: str = Field(min_length=1, max_length=100, description="Whose key it is; no patient's name.")
+    name: Annotated[str, AfterValidator(checked_name)] = Field(
+        min_length=1, max_length=100, description="Whose key it is; no patient's name. No control characters."
+    )
     scopes: list[Literal["upload", "read", "label", "intraoperative", "admin"]] = Field(min_length=1, fail_fast=True)
     project: str | None = Field(
         default=None,
@@ -164,7 +166,7 @@ def list_audit(
         str | None, Query(pattern=r"^[a-z]{2,5}_[0-9a-z]{26}$", description="Only entries about this object.")
     ] = None,
     project: InProject = None,
-    after: Annotated[int | None, Query(ge=1, description="`next` of the page before.")] = None,
+    after: Annotated[int | None, Query(ge=1, le=10**18, description="`next` of the page before.")] = None,
     limit: Limit = 100,
     sort: Sort = "-created_at",
 ) -> Page[Audited]:

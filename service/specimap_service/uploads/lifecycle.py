@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import hashlib
 import os
+import re
 import shutil
 import time
 from collections.abc import Mapping
@@ -74,7 +75,7 @@ class Uploads:
             raise RequestInvalidError(
                 "Upload-Metadata names no role.", advice=f"Give `role`: one of {', '.join(ROLES)}.", field="role"
             )
-        if not acquisition_id:
+        if not re.fullmatch(r"acq_[0-9a-z]{26}", acquisition_id):
             raise RequestInvalidError(
                 "Upload-Metadata names no acquisition.", advice="Give `acquisition`: its id.", field="acquisition"
             )
