@@ -71,11 +71,12 @@ def test_job_is_submitted_again_under_the_same_idempotency_key(waits: list[float
 
 
 def test_what_creates_is_repeated_under_one_idempotency_key(waits: list[float]) -> None:
-    for create in (
+    creations: tuple[Callable[[sc.Client], object], ...] = (
         lambda client: client.acquisitions.create("S26-1"),
         lambda client: client.keys.create("tablet", ["read"]),
         lambda client: client.projects.create("study-7"),
-    ):
+    )
+    for create in creations:
         handler, seen = answers(BROKEN, problem(503, "x"), problem(422, "request_invalid"))
         with client_of(handler) as client, pytest.raises(sc.Refused):
             create(client)

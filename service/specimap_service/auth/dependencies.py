@@ -61,7 +61,7 @@ async def authenticated(request: Request) -> Principal:
     try:
         left = limiter.take(found.key_id, found.rate_per_minute)
     except RateLimitedError as error:
-        left = Left(found.rate_per_minute, 0, error.details["retry_after_s"])
+        left = Left(found.rate_per_minute, 0, int(str(error.details["retry_after_s"])))
         raise
     finally:
         request.scope.get(ANSWER_HEADERS, {}).update(left.headers())
