@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ssl
 import traceback
+from collections.abc import Callable
 
 import httpx
 import pytest
