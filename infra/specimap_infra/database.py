@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,9 +15,11 @@ from sqlalchemy.orm import Session, sessionmaker
 
 from specimap_core.atomic import disk_errors
 from specimap_infra.availability import Availability
-from specimap_infra.errors import DatabaseUnavailableError
+from specimap_infra.errors import DatabaseDamagedError, DatabaseUnavailableError
 from specimap_infra.postgres import make_postgres_engine
 from specimap_infra.private_files import make_private
+
+DAMAGED = (sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_CORRUPT)
 
 
 def make_engine(url: str, *, pool_size: int = 10) -> sa.Engine:
@@ -82,7 +85,10 @@ class Database:
 
 @contextmanager
 def database_errors() -> Iterator[None]:
-    """Turn lost connections into DatabaseUnavailableError; let other errors pass."""
+    """Turn lost connections into DatabaseUnavailableError, and a file that is no database into DatabaseDamagedError.
+
+    Other errors pass.
+    """
     try:
         yield
     except (OperationalError, sa.exc.TimeoutError) as error:
@@ -90,6 +96,12 @@ def database_errors() -> Iterator[None]:
     except DBAPIError as error:
         if error.connection_invalidated:
             raise _unavailable(error) from error
+        if getattr(error.orig, "sqlite_errorcode", None) in DAMAGED:
+            raise DatabaseDamagedError(
+                f"The database's file is damaged or is no database ({error.orig}).",
+                advice="Look at SPECIMAP_DATABASE_URL and SPECIMAP_DATA_DIR; "
+                "if they name the right one, restore a backup.",
+            ) from error
         raise
 
 

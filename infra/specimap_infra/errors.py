@@ -41,6 +41,12 @@ class DatabaseUnavailableError(SpecimapError, RuntimeError):
     code = "database_unavailable"
 
 
+class DatabaseDamagedError(SpecimapError, RuntimeError):
+    """The file of a SQLite database is none, or a damaged one."""
+
+    code = "database_damaged"
+
+
 class DatabaseTooNewError(SpecimapError, RuntimeError):
     """A newer release has brought the database to its schema; ``details['version']``."""
 

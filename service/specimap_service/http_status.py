@@ -43,6 +43,7 @@ HTTP_STATUS: dict[type[SpecimapError], int] = {
     core.UnknownDictionaryError: 422,
     core.WrongDictionaryError: 422,
     infra.BackupInvalidError: 422,
+    infra.DatabaseDamagedError: 500,
     infra.DatabaseTooNewError: 503,
     infra.DatabaseUnavailableError: 503,
     infra.JobConflictError: 409,

@@ -143,3 +143,20 @@ def test_database_that_does_not_answer_is_told(tmp_path: Path) -> None:
     assert done.returncode == 2
     assert done.stderr.startswith("database_unavailable: ")
     assert "Traceback" not in done.stderr
+
+
+def test_a_file_that_is_no_database_is_told_and_left(tmp_path: Path) -> None:
+    file = tmp_path / "specimap.db"
+    file.write_bytes(b"a letter, not a database. " * 100)
+    done = keys(tmp_path, "list")
+    assert done.returncode == 2
+    assert done.stderr.startswith("database_damaged: ")
+    assert "SPECIMAP_DATA_DIR" in done.stderr
+    assert file.read_bytes() == b"a letter, not a database. " * 100
+
+
+def test_a_data_folder_that_is_a_file_is_told(tmp_path: Path) -> None:
+    (tmp_path / "data").write_text("")
+    done = keys(tmp_path / "data", "list")
+    assert done.returncode == 2
+    assert done.stderr.startswith("output_not_writable: ")
