@@ -44,7 +44,7 @@ TARGETS = (
     Target("solve", _STAGES, "adjust"),
     Target("features", f"{_RECONSTRUCT}.poses", "pose_by_resection", splits=True),
     Target("features", f"{_RECONSTRUCT}.poses", "pose_by_structure_from_motion", splits=True),
-    Target("dense matching", f"{_RECONSTRUCT}.backends.colmap", "measure_depth"),
+    Target("dense matching", f"{_RECONSTRUCT}.backends.colmap", "dense_depth"),
     Target("Open3D waited for", "specimap_core.surface.fusion", "open3d", splits=True),
     Target("fusion", _STAGES, "fuse"),
     Target("refinement", _STAGES, "refine_mesh"),

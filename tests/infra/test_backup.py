@@ -201,7 +201,9 @@ def test_rows_of_every_table_return_also_those_of_an_earlier_schema(
     migrate(database)
     expected = contents(database)
     database.close()
-    assert sum(map(bool, expected.values())) == len(expected) - 2
+    # The earlier schema's jobs were filled in without an idempotency key.
+    empty = {"artefacts", "leases"} | ({"repeatable_requests"} if earlier else set())
+    assert {table for table, rows in expected.items() if not rows} == empty
     restored = Database.open(target.database)
     found = contents(restored)
     restored.close()

@@ -88,7 +88,7 @@ def shallow(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path, OnDisk], dict[st
     from specimap_core.reconstruct.backend import ReconstructSettings, corners_in_photos, detect_in_photos
     from specimap_core.reconstruct.backends import colmap
 
-    monkeypatch.setattr(colmap, "measure_depth", lambda *_, **__: ([], ()))
+    monkeypatch.setattr(colmap, "dense_depth", lambda *_, **__: [])
 
     def pose(folder: Path, phantom: OnDisk) -> dict[str, str]:
         photos, refused = read_photos(photo_paths(folder), AcquisitionSettings())
