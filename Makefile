@@ -12,7 +12,7 @@ RUN := $(VENV)/bin
 STAMP := $(VENV)/.specimap-installed
 LEARNED := $(VENV)/.specimap-learned
 DEMO_OUT ?= out/demo
-TEST_PROCESSES ?= 4
+TEST_PROCESSES ?= 3
 
 help:
 	@echo "make setup   install the pinned versions into $(VENV)"
