@@ -6,16 +6,20 @@ import os
 import tempfile
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
 
 import psycopg
 import pytest
+import sqlalchemy as sa
 from psycopg import sql
 
 from specimap_infra.database import Database
 from specimap_infra.migrate import migrate
+
+TEST_DATABASE = "specimap_test_"
+"""How the names of the databases begin that tests make in the server."""
 
 
 def postgres_server() -> psycopg.Connection:
@@ -34,7 +38,7 @@ def postgres_server() -> psycopg.Connection:
 @contextmanager
 def postgres_url() -> Iterator[str]:
     """URL of an empty database of its own, dropped afterwards."""
-    name = f"specimap_test_{uuid.uuid4().hex[:12]}"
+    name = f"{TEST_DATABASE}{uuid.uuid4().hex[:12]}"
     with postgres_server() as server:
         server.execute(sql.SQL("CREATE DATABASE {}").format(sql.Identifier(name)))
         info = server.info
@@ -43,6 +47,11 @@ def postgres_url() -> Iterator[str]:
             yield f"postgresql://{account}@{info.host}:{info.port}/{name}"
         finally:
             server.execute(sql.SQL("DROP DATABASE {} WITH (FORCE)").format(sql.Identifier(name)))
+
+
+def sqlalchemy_url(url: str) -> str:
+    """A ``database_url`` as SQLAlchemy takes it."""
+    return url.replace("postgresql://", "postgresql+psycopg://", 1)
 
 
 @cache
@@ -57,14 +66,45 @@ def _empty_sqlite() -> bytes:
         return Path(folder, "empty.db").read_bytes()
 
 
+_at_end = ExitStack()
+"""What this process removes when its tests have ended."""
+
+
+@cache
+def _postgres_template() -> str:
+    """Name of a PostgreSQL database with all tables and no rows, which nobody is connected to."""
+    url = _at_end.enter_context(postgres_url())
+    database = Database.open(sqlalchemy_url(url))
+    migrate(database)
+    database.close()
+    return url.rsplit("/", 1)[1]
+
+
+def pytest_sessionfinish() -> None:
+    """Drop the template."""
+    _at_end.close()
+
+
 def create_tables(database: Database) -> None:
-    """All tables in an empty database: for a new SQLite file as a copy, since migrating takes longer than a test."""
+    """All tables in an empty database, as a copy: migrating takes longer than most tests.
+
+    One that holds something already, or that no test made, is brought to this version's schema.
+    """
     url = database.engine.url
-    path = Path(url.database or "")
-    if url.get_backend_name() == "sqlite" and not path.exists():
-        path.write_bytes(_empty_sqlite())
-    else:
-        migrate(database)
+    path, name = Path(url.database or ""), url.database or ""
+    if url.get_backend_name() == "sqlite":
+        # Opening a database makes its file.
+        if not path.exists() or not path.stat().st_size:
+            path.write_bytes(_empty_sqlite())
+            return
+    elif name.startswith(TEST_DATABASE) and not sa.inspect(database.engine).get_table_names():
+        database.close()
+        with postgres_server() as server:
+            server.execute(sql.SQL("DROP DATABASE {} WITH (FORCE)").format(sql.Identifier(name)))
+            made = sql.SQL("CREATE DATABASE {} TEMPLATE {}")
+            server.execute(made.format(sql.Identifier(name), sql.Identifier(_postgres_template())))
+        return
+    migrate(database)
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
@@ -80,7 +120,7 @@ def any_database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str
 @pytest.fixture
 def tables(any_database: str) -> Iterator[Database]:
     """A database of each kind with all tables."""
-    database = Database.open(any_database.replace("postgresql://", "postgresql+psycopg://", 1))
+    database = Database.open(sqlalchemy_url(any_database))
     create_tables(database)
     yield database
     database.close()
