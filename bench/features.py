@@ -22,8 +22,9 @@ from specimap_core.reconstruct.dense.settings import DepthSettings
 from specimap_core.reconstruct.dense.volume import volume_over
 from specimap_core.reconstruct.features.choice import aliked_missing
 from specimap_core.reconstruct.poses import Posed, pose_photos
-from specimap_core.surface.fusion import Mesh, SurfaceSettings, fuse, vertex_normals
+from specimap_core.surface.fusion import Mesh, fuse, vertex_normals
 from specimap_core.surface.raycast import RayCaster
+from specimap_core.surface.settings import SurfaceSettings
 from specimap_core.truth.truth_file import Truth
 from specimap_validation.phantom import PhantomSettings, write_phantom
 from specimap_validation.phantom.views import photo_views

@@ -13,7 +13,8 @@ from pydantic import TypeAdapter, ValidationError
 from specimap_core.fiducials.observations import Observations
 from specimap_core.geometry.cameras import Intrinsics, Pose
 from specimap_core.notices import CATALOGUE, RETIRED, Notice
-from specimap_core.pipeline.artefacts import Stage1, Store, load_stage1, save_stage1
+from specimap_core.pipeline.artefact_store import Store
+from specimap_core.pipeline.artefacts import Stage1, load_stage1, save_stage1
 from specimap_core.reconstruct.backend import CornersInPhotos, Reconstruction
 from specimap_core.report.wording import GRAVE, WARNING_ADVICE
 from tests.support.error_tables import table_of

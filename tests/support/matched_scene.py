@@ -15,9 +15,10 @@ from specimap_core.geometry.depth_map import DepthMap
 from specimap_core.reconstruct.dense.multi_view import dense_depth
 from specimap_core.reconstruct.dense.settings import DepthSettings
 from specimap_core.reconstruct.dense.volume import Volume, volume_over
-from specimap_core.surface.fusion import Mesh, SurfaceSettings, fuse
+from specimap_core.surface.fusion import Mesh, fuse
 from specimap_core.surface.refinement import pixel_footprint_mm
 from specimap_core.surface.regions import worth_refining
+from specimap_core.surface.settings import SurfaceSettings
 from specimap_validation.phantom import Phantom, PhantomSettings
 
 CLEAR_MM = 2.0

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import sqlalchemy as sa
 
-from specimap_core.pipeline.artefacts import Store
+from specimap_core.pipeline.artefact_store import Store
 from specimap_infra import jobs
 from specimap_infra.database import Database
 from specimap_infra.ids import new_id

@@ -15,12 +15,12 @@ from specimap_core.atomic import write_text
 from specimap_core.bundle_adjust.adjust import Form
 from specimap_core.errors import OutputExistsError
 from specimap_core.json_text import json_text
-from specimap_core.pipeline.artefacts import FORMAT
+from specimap_core.pipeline.artefact_store import FORMAT
 from specimap_core.pipeline.outputs import Inputs, prepare_folder
 from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.progress import within
 from specimap_core.register.figures import Section
-from specimap_core.register.placement import Method
+from specimap_core.register.settings import Method
 from specimap_validation.capture import Capture, find_capture
 from specimap_validation.cases import Case
 from specimap_validation.phantom import load_truth, write_phantom

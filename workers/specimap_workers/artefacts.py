@@ -11,7 +11,7 @@ import sqlalchemy as sa
 from sqlalchemy.orm import Session
 
 from specimap_core.errors import NotFoundError
-from specimap_core.pipeline.artefacts import Store
+from specimap_core.pipeline.artefact_store import Store
 from specimap_infra.database import Database
 from specimap_infra.ids import new_id
 from specimap_infra.jobs import held

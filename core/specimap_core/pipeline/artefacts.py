@@ -1,30 +1,23 @@
-"""Artefacts of finished stages on disk, keyed by a hash of everything that went into them."""
+"""What each stage leaves on disk for the next ones."""
 
 from __future__ import annotations
 
 import hashlib
-import json
-import zipfile
-import zlib
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from itertools import starmap
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core import __version__
 from specimap_core.arrays import Floats
-from specimap_core.atomic import atomic_path, remove
 from specimap_core.bundle_adjust.adjust import Adjusted
 from specimap_core.fiducials.observations import Observations
 from specimap_core.geometry.cameras import Intrinsics, Pose
 from specimap_core.geometry.depth_map import DepthMap
-from specimap_core.json_text import json_text
 from specimap_core.notices import Notice
 from specimap_core.photos.reading import Refusal
+from specimap_core.pipeline.artefact_store import Store
 from specimap_core.reconstruct.backend import CornersInPhotos, Reconstruction
 from specimap_core.render.orthographic import Grid
 from specimap_core.surface.fusion import Mesh
@@ -33,8 +26,6 @@ DEPTH_STEPS = 65534
 GRIDS = ("coarse", "fine")
 IMAGES = ("depth_", "colour_", "confidence_", "turn_", "greys")
 """Arrays of stage 1 that stage 2 alone needs: hundreds of megabytes."""
-FORMAT = 4
-"""Counts up when what a stage saves, or how a stage computes it, changes: older artefacts are then not reused."""
 
 
 @dataclass(frozen=True)
@@ -64,46 +55,6 @@ class Stage2:
     adjusted: Adjusted
     mesh: Mesh
     sigma_mm: Floats
-
-
-def key_of(stage: str, parts: Mapping[str, object]) -> str:
-    """Hash of a stage's name, the program's version and what went into the stage."""
-    text = json_text({"stage": stage, "version": __version__, "format": FORMAT, **parts}, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:24]
-
-
-class Store:
-    """Artefacts in a folder: one file a stage, with the key in its name; a new one replaces the old."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    def path(self, stage: str, key: str) -> Path:
-        """Where the artefact of that key lies, or would lie."""
-        return self.folder / f"{stage}-{key}.npz"
-
-    def save(self, stage: str, key: str, arrays: Mapping[str, np.ndarray[Any, Any]], meta: object) -> None:
-        """Write an artefact whole or not at all, then drop older ones of the stage."""
-        target = self.path(stage, key)
-        with atomic_path(target) as aside, open(aside, "wb") as f:
-            np.savez(f, meta=np.array(json_text(meta)), **arrays)  # type: ignore[arg-type]
-        for old in self.folder.glob(f"{stage}-*.npz"):
-            if old != target:
-                remove(old)
-
-    def load(self, stage: str, key: str, passed_over: tuple[str, ...] = ()) -> tuple[dict[str, Any], Any] | None:
-        """Arrays and meta of an artefact; None where there is none of that key, or it does not read.
-
-        Arrays whose names start with one of ``passed_over`` stay on the disk.
-        """
-        path = self.path(stage, key)
-        try:
-            with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-                arrays = {name: archive[name] for name in archive.files if not name.startswith(passed_over)}
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
-            return None
-        meta = json.loads(str(arrays.pop("meta")))
-        return arrays, meta
 
 
 def _poses(poses: tuple[Pose, ...]) -> np.ndarray[Any, Any]:

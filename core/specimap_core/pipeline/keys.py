@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 
 from specimap_core.json_text import json_text
-from specimap_core.pipeline.artefacts import key_of
+from specimap_core.pipeline.artefact_store import key_of
 from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.reconstruct.backends.environment import UNCONFIGURED, BackendSettings, backend_identity
 

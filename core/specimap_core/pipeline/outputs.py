@@ -11,7 +11,7 @@ from pathlib import Path
 
 from specimap_core.atomic import disk_errors, remove, remove_leftovers, replace
 from specimap_core.errors import OutputExistsError, OutputNotWritableError
-from specimap_core.pipeline.artefacts import Store
+from specimap_core.pipeline.artefact_store import Store
 
 MARK = ".specimap"
 """A file in every output folder; a folder with other files and without it is not written to."""

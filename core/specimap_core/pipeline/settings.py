@@ -12,10 +12,9 @@ from specimap_core.pipeline.options import Backend, RunOptions, check_choice, ch
 from specimap_core.reconstruct.backend import ReconstructSettings
 from specimap_core.reconstruct.dense.device import DEVICES, Device
 from specimap_core.reconstruct.dense.settings import DepthSettings
-from specimap_core.register.placement import RegisterSettings
-from specimap_core.render.orthographic import RenderSettings
-from specimap_core.surface.fusion import SurfaceSettings
-from specimap_core.surface.refinement import RefineSettings
+from specimap_core.register.settings import RegisterSettings
+from specimap_core.render.settings import RenderSettings
+from specimap_core.surface.settings import RefineSettings, SurfaceSettings
 
 WITH_OWN_CAMERAS = ("mast3r",)
 """Backends that find cameras without the markers."""

@@ -17,10 +17,10 @@ from specimap_core.native import preload
 from specimap_core.notices import Notice
 from specimap_core.photos.contact_sheet import contact_sheet
 from specimap_core.photos.reading import Photo, read_photos, stated_focal_px
+from specimap_core.pipeline.artefact_store import Store
 from specimap_core.pipeline.artefacts import (
     Stage1,
     Stage2,
-    Store,
     load_grids,
     load_stage1,
     save_grids,

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -18,20 +17,11 @@ from specimap_core.geometry.cameras import View
 from specimap_core.render.orthographic import Grid
 from specimap_core.surface.raycast import RayCaster
 
-Method = Literal["camera", "homography"]
 GRAZING_DEG = 70.0
 STRIP_PIXELS = 1 << 16
 STRIP_WORKERS = 2
 CLEARANCE_MM = 0.02
 """How far from a place a ray to whatever may hide it starts: beyond rounding. More would miss what hides near by."""
-
-
-@dataclass(frozen=True)
-class RegisterSettings:
-    """``method``: ``camera`` or ``homography``. ``ransac_px``: inlier distance on the coarse grid, as published."""
-
-    method: Method = "camera"
-    ransac_px: float = 3.0
 
 
 @dataclass(frozen=True)

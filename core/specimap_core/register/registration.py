@@ -19,14 +19,13 @@ from specimap_core.register.cube_markers import CubeMarkers, find_markers, unmir
 from specimap_core.register.figures import MethodFigures
 from specimap_core.register.placement import (
     Homography,
-    Method,
-    RegisterSettings,
     fit_homography,
     homography_xyz,
     place_by_camera,
     place_by_homography,
 )
 from specimap_core.register.points import cloud_points
+from specimap_core.register.settings import Method, RegisterSettings
 from specimap_core.render.orthographic import Grid
 from specimap_core.surface.raycast import RayCaster
 

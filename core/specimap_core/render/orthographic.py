@@ -15,14 +15,6 @@ LARGEST_GRID_CELLS = 25_000_000
 
 
 @dataclass(frozen=True)
-class RenderSettings:
-    """``r_reg_mm``: cell of the coarse grid, on which the homography is fitted; ``r_pc_mm``: of the fine grid."""
-
-    r_reg_mm: float = 2.0
-    r_pc_mm: float = 0.5
-
-
-@dataclass(frozen=True)
 class Grid:
     """A top view. Row-major; the centre of cell (0, 0) lies at (``x_min``, ``y_min``) mm, rows grow with y.
 

@@ -14,28 +14,13 @@ from specimap_core.errors import DepthNotFoundError
 from specimap_core.geometry.cameras import Pose
 from specimap_core.geometry.depth_map import DepthMap
 from specimap_core.native import open3d
+from specimap_core.surface.settings import SurfaceSettings
 
 BLOCK_VOXELS = 8
 """Edge of a block of voxels: 16 touch twice the memory and time for the same surface."""
 FIRST_BLOCKS = 16_000
 NEAREST_MM = 1.0
 """Depth from which on it counts: no lens is nearer."""
-
-
-@dataclass(frozen=True)
-class SurfaceSettings:
-    """Fusion.
-
-    ``voxel_mm``: edge of a voxel; by default twice a photo's pixel on the specimen, which is 0.3 mm for photos of
-    512 pixels that show the layout. ``truncation_voxels``: reach of a depth on either side. ``least_weight``:
-    depths that must agree on a voxel. ``smallest_part_share``: connected parts with fewer triangles than this
-    share of the largest are dropped.
-    """
-
-    voxel_mm: float | None = None
-    truncation_voxels: float = 4.0
-    least_weight: float = 3.0
-    smallest_part_share: float = 0.02
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from specimap_core.geometry.cameras import Intrinsics, Pose
 from specimap_core.progress import within
 from specimap_core.surface.fusion import Mesh, edges_between, vertex_normals
 from specimap_core.surface.photo_consistency import Photographs, choose_views, patch_scores
+from specimap_core.surface.settings import Pass, RefineSettings
 
 CHUNK = 2048
 
@@ -39,35 +40,6 @@ class Refined:
     views: NDArray[np.uint8]
     sharpness: NDArray[np.float32]
     found: NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class Pass:
-    """One round: the farthest offset ``reach_voxels``, how many ``steps`` are tried, ``views`` compared;
-    ``half_samples``: the patch is (2 n + 1)^2 samples, a photo's pixel apart on the surface; ``keep_views``: compare
-    the photos of the round before, which choosing anew would hardly change."""
-
-    reach_voxels: float
-    steps: int
-    views: int
-    half_samples: int = 2
-    keep_views: bool = False
-
-
-@dataclass(frozen=True)
-class RefineSettings:
-    """Photo-consistent refinement.
-
-    ``passes``: the rounds; the last, on smaller patches, brings out what is narrower than the others'.
-    ``least_score``: correlation below which a vertex follows its neighbours. ``smoothness``: weight of the
-    neighbours.
-    """
-
-    passes: tuple[Pass, ...] = (Pass(2.0, 11, 9), Pass(0.8, 5, 9), Pass(0.5, 5, 9, half_samples=1, keep_views=True))
-    least_score: float = 0.3
-    smoothness: float = 0.2
-    smoothing_rounds: int = 10
-    least_cosine: float = 0.25
 
 
 def pixel_footprint_mm(lens: Intrinsics, poses: tuple[Pose, ...], target: Floats) -> float:

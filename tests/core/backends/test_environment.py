@@ -15,7 +15,7 @@ import pytest
 
 from specimap_core.bundle_adjust.adjust import AdjustSettings
 from specimap_core.errors import BackendUnavailableError, SettingsError
-from specimap_core.pipeline.artefacts import key_of
+from specimap_core.pipeline.artefact_store import key_of
 from specimap_core.pipeline.keys import surface_keys
 from specimap_core.pipeline.options import Adjustment, Backend, RunOptions
 from specimap_core.pipeline.settings import PipelineSettings, settings_from

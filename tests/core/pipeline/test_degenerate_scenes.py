@@ -29,9 +29,10 @@ from specimap_core.reconstruct.poses_from_markers import solve_from_markers
 from specimap_core.register.placement import fit_homography, place_by_camera, place_by_homography
 from specimap_core.register.points import cloud_points
 from specimap_core.render.orthographic import extent_of, render_grid
-from specimap_core.surface.fusion import Mesh, SurfaceSettings, fuse, vertex_normals
+from specimap_core.surface.fusion import Mesh, fuse, vertex_normals
 from specimap_core.surface.raycast import RayCaster
-from specimap_core.surface.refinement import RefineSettings, refine_mesh
+from specimap_core.surface.refinement import refine_mesh
+from specimap_core.surface.settings import RefineSettings, SurfaceSettings
 from specimap_core.surface.uncertainty import mesh_sigma
 from tests.support.scenes import UNNAMED, bump_mesh, marker_scene
 

@@ -11,7 +11,7 @@ from specimap_core.errors import EdgeImplausibleError, SettingsError
 from specimap_core.geometry.cameras import Pose
 from specimap_core.pipeline.scale_check import check_scale, reach_mm
 from specimap_core.pipeline.settings import PipelineSettings
-from specimap_core.render.orthographic import RenderSettings
+from specimap_core.render.settings import RenderSettings
 from tests.support.scenes import marker_scene
 
 

@@ -16,7 +16,7 @@ from specimap_core.reconstruct.dense.pairs import choose_pairs
 from specimap_core.reconstruct.dense.settings import DepthSettings
 from specimap_core.reconstruct.dense.stereo import viewing_angles_deg
 from specimap_core.reconstruct.dense.volume import Volume, lattice_over, volume_over
-from specimap_core.surface.fusion import SurfaceSettings
+from specimap_core.surface.settings import SurfaceSettings
 from specimap_validation.phantom import Phantom, PhantomSettings
 from tests.support.true_depth import true_depth
 

@@ -16,7 +16,7 @@ from specimap_core.geometry.cameras import fit_similarity
 from specimap_core.pipeline.outputs import Inputs
 from specimap_core.pipeline.run import run_pipeline
 from specimap_core.pipeline.settings import PipelineSettings
-from specimap_core.register.placement import Method, RegisterSettings
+from specimap_core.register.settings import Method, RegisterSettings
 from specimap_core.surface.fusion import Mesh
 from specimap_core.surface.raycast import RayCaster
 from specimap_core.truth.truth_file import Truth

@@ -11,7 +11,8 @@ from specimap_core.errors import DepthNotFoundError
 from specimap_core.geometry.cameras import Intrinsics, Pose
 from specimap_core.geometry.depth_map import DepthMap
 from specimap_core.reconstruct.dense.volume import Volume, inside_volume
-from specimap_core.surface.fusion import SurfaceSettings, fuse
+from specimap_core.surface.fusion import fuse
+from specimap_core.surface.settings import SurfaceSettings
 
 LENS = Intrinsics.centred(40, 30, 50.0)
 EMPTY = DepthMap(

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from specimap_core.errors import CancelledError
 from specimap_core.surface.fusion import Mesh
-from specimap_core.surface.refinement import Pass, Refined, RefineSettings, pixel_footprint_mm, refine_mesh
+from specimap_core.surface.refinement import Refined, pixel_footprint_mm, refine_mesh
 from specimap_core.surface.regions import worth_refining
+from specimap_core.surface.settings import Pass, RefineSettings
 from specimap_core.surface.uncertainty import LEAST_SIGMA_MM
 from tests.support.matched_scene import Matched, matched
 

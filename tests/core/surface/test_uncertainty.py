@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from specimap_core.arrays import Singles
 from specimap_core.surface.fusion import Mesh
-from specimap_core.surface.refinement import Refined, RefineSettings, refine_mesh
+from specimap_core.surface.refinement import Refined, refine_mesh
+from specimap_core.surface.settings import RefineSettings
 from specimap_core.surface.uncertainty import (
     AGREEMENT_MM,
     LEAST_SIGMA_MM,
