@@ -9,39 +9,50 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 
+from tests.support.scenes import Answer, specimap
 from tests.support.service_scene import serving
 
-PROGRAM = "from specimap_cli.{0} import {0}_app; {0}_app()"
+PROGRAM = "from specimap_cli import main; main()"
 
 
-def keys(
-    folder: Path, *arguments: str, database_url: str = "", program: str = "keys"
-) -> subprocess.CompletedProcess[str]:
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("SPECIMAP_")}
-    environment |= {"SPECIMAP_DATA_DIR": str(folder), "SPECIMAP_DATABASE_URL": database_url}
-    command = [sys.executable, "-W", "error", "-c", PROGRAM.format(program), *arguments]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+def environment(folder: Path, database_url: str) -> dict[str, str]:
+    others = {name: value for name, value in os.environ.items() if not name.startswith("SPECIMAP_")}
+    return others | {"SPECIMAP_DATA_DIR": str(folder), "SPECIMAP_DATABASE_URL": database_url}
+
+
+def started(folder: Path, *arguments: str, database_url: str = "") -> Answer:
+    """What the program says in a process of its own, as at a shell."""
+    command = [sys.executable, "-W", "error", "-c", PROGRAM, *arguments]
+    own = environment(folder, database_url)
+    done = subprocess.run(command, env=own, capture_output=True, text=True, timeout=120)
+    return Answer(done.returncode, done.stdout, done.stderr)
+
+
+def keys(folder: Path, *arguments: str, database_url: str = "", program: str = "keys") -> Answer:
+    """The same in this process, since an interpreter's start takes longer than a command."""
+    with mock.patch.dict(os.environ, environment(folder, database_url), clear=True):
+        return specimap(program, *arguments)
 
 
 def listed(folder: Path, database_url: str = "") -> list[dict[str, Any]]:
     done = keys(folder, "list", "--json", database_url=database_url)
-    assert done.returncode == 0, done.stderr
-    return [json.loads(line) for line in done.stdout.splitlines()]
+    assert done.status == 0, done.err
+    return [json.loads(line) for line in done.out.splitlines()]
 
 
 @pytest.mark.slow
 def test_key_is_made_before_the_first_start_and_opens_the_service(tmp_path: Path, any_database: str) -> None:
-    done = keys(
-        tmp_path, "create", "--name", "tablet 3", "--scope", "read", "--scope", "upload", database_url=any_database
-    )
-    assert done.returncode == 0, done.stderr
-    key = done.stdout.removesuffix("\n")
+    wanted = ("--name", "tablet 3", "--scope", "read", "--scope", "upload")
+    done = started(tmp_path, "keys", "create", *wanted, database_url=any_database)
+    assert done.status == 0, done.err
+    key = done.out.removesuffix("\n")
     assert key.startswith("spk_")
     assert "\n" not in key
-    assert key not in done.stderr
+    assert key not in done.err
     (row,) = listed(tmp_path, any_database)
     assert {name: row[name] for name in ("name", "scopes", "state", "last_used_at")} == {
         "name": "tablet 3",
@@ -56,7 +67,7 @@ def test_key_is_made_before_the_first_start_and_opens_the_service(tmp_path: Path
         assert client.get("/v1/jobs").status_code == 200
         assert client.get("/v1/keys").status_code == 403
         revoked = keys(tmp_path, "revoke", str(row["id"]), database_url=any_database)
-        assert (revoked.returncode, revoked.stdout) == (0, "")
+        assert (revoked.status, revoked.out) == (0, "")
         service.app.state.keyring.forget()
         assert client.get("/v1/jobs").status_code == 401
         audited = service.client().get("/v1/audit", params={"target": row["id"]}).json()["items"]
@@ -64,31 +75,30 @@ def test_key_is_made_before_the_first_start_and_opens_the_service(tmp_path: Path
     assert listed(tmp_path, any_database)[0]["state"] == "revoked"
 
 
-@pytest.mark.slow
 def test_projects_are_made_and_keys_are_made_for_them(tmp_path: Path) -> None:
-    def projects(*arguments: str) -> subprocess.CompletedProcess[str]:
+    def projects(*arguments: str) -> Answer:
         return keys(tmp_path, *arguments, program="projects")
 
     made = projects("create", "study-7")
-    assert made.returncode == 0, made.stderr
-    project = made.stdout.strip()
+    assert made.status == 0, made.err
+    project = made.out.strip()
     taken = projects("create", "study-7")
-    assert (taken.returncode, taken.stdout) == (2, "")
-    assert taken.stderr.startswith("state_conflict: ")
-    assert projects("create", "study-9\n").stderr.startswith("setting_invalid: ")
-    assert projects("rename", "study-7", "Anna Muster").stderr.startswith("setting_invalid: ")
-    assert projects("rename", "study-7", "study-8").returncode == 0
-    rows = [json.loads(line) for line in projects("list", "--json").stdout.splitlines()]
+    assert (taken.status, taken.out) == (2, "")
+    assert taken.err.startswith("state_conflict: ")
+    assert projects("create", "study-9\n").err.startswith("setting_invalid: ")
+    assert projects("rename", "study-7", "Anna Muster").err.startswith("setting_invalid: ")
+    assert projects("rename", "study-7", "study-8").status == 0
+    rows = [json.loads(line) for line in projects("list", "--json").out.splitlines()]
     assert [row["name"] for row in rows] == ["default", "study-8"]
     assert rows[1]["id"] == project
-    assert f"{project}  study-8" in projects("list").stdout
+    assert f"{project}  study-8" in projects("list").out
     for wanted in ("study-8", project):
         done = keys(tmp_path, "create", "--name", "a", "--scope", "upload", "--project", wanted)
-        assert done.returncode == 0, done.stderr
-        assert "study-8" in done.stderr
+        assert done.status == 0, done.err
+        assert "study-8" in done.err
     unknown = keys(tmp_path, "create", "--name", "a", "--scope", "read", "--project", "study-7")
-    assert (unknown.returncode, unknown.stdout) == (2, "")
-    assert unknown.stderr.startswith("not_found: ")
+    assert (unknown.status, unknown.out) == (2, "")
+    assert unknown.err.startswith("not_found: ")
     keys(tmp_path, "create", "--name", "b", "--scope", "intraoperative")
     assert [(row["project"], row["scopes"]) for row in listed(tmp_path)] == [
         ("study-8", ["upload"]),
@@ -103,20 +113,18 @@ def test_projects_are_made_and_keys_are_made_for_them(tmp_path: Path) -> None:
         assert actions == ["key.create", "key.create", "project.rename", "project.create"]
 
 
-@pytest.mark.slow
 def test_expiry_and_table(tmp_path: Path) -> None:
     later = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=400)
     done = keys(tmp_path, "create", "--name", "x" * 90, "--scope", "admin", "--expires", f"{later:%Y-%m-%d}")
-    assert done.returncode == 0, done.stderr
+    assert done.status == 0, done.err
     (row,) = listed(tmp_path)
     assert row["expires_at"] == f"{later:%Y-%m-%d}T00:00:00+00:00"
-    table = keys(tmp_path, "list").stdout
+    table = keys(tmp_path, "list").out
     assert str(row["id"]) in table
     assert "x" * 90 in table
-    assert done.stdout.strip().rsplit("_", 1)[1] not in table
+    assert done.out.strip().rsplit("_", 1)[1] not in table
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
@@ -132,31 +140,30 @@ def test_expiry_and_table(tmp_path: Path) -> None:
 )
 def test_what_cannot_be_is_refused_with_advice(tmp_path: Path, arguments: list[str], told: str) -> None:
     done = keys(tmp_path, *arguments)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert told in done.stderr
-    assert "Traceback" not in done.stderr
+    assert (done.status, done.out) == (2, "")
+    assert told in done.err
+    assert "Traceback" not in done.err
 
 
-@pytest.mark.slow
 def test_database_that_does_not_answer_is_told(tmp_path: Path) -> None:
     done = keys(tmp_path, "list", database_url="postgresql://nobody@127.0.0.1:1/none")
-    assert done.returncode == 2
-    assert done.stderr.startswith("database_unavailable: ")
-    assert "Traceback" not in done.stderr
+    assert done.status == 2
+    assert done.err.startswith("database_unavailable: ")
+    assert "Traceback" not in done.err
 
 
 def test_a_file_that_is_no_database_is_told_and_left(tmp_path: Path) -> None:
     file = tmp_path / "specimap.db"
     file.write_bytes(b"a letter, not a database. " * 100)
     done = keys(tmp_path, "list")
-    assert done.returncode == 2
-    assert done.stderr.startswith("database_damaged: ")
-    assert "SPECIMAP_DATA_DIR" in done.stderr
+    assert done.status == 2
+    assert done.err.startswith("database_damaged: ")
+    assert "SPECIMAP_DATA_DIR" in done.err
     assert file.read_bytes() == b"a letter, not a database. " * 100
 
 
 def test_a_data_folder_that_is_a_file_is_told(tmp_path: Path) -> None:
     (tmp_path / "data").write_text("")
     done = keys(tmp_path / "data", "list")
-    assert done.returncode == 2
-    assert done.stderr.startswith("output_not_writable: ")
+    assert done.status == 2
+    assert done.err.startswith("output_not_writable: ")
