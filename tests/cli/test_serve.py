@@ -13,6 +13,7 @@ from specimap_client import Client
 from specimap_core.cloud import Cloud
 from specimap_core.report.model import Report
 from tests.support.places import ROOT
+from tests.support.plain_http import NO_TLS
 from tests.support.scenes import OnDisk
 from tests.support.serve_scene import running
 from tests.support.worker_scene import processes_of, until
@@ -32,7 +33,9 @@ def test_first_start_tells_address_and_key_and_the_second_only_the_address(tmp_p
     assert (tmp_path / "data").stat().st_mode & 0o077 == 0
     with running(tmp_path / "data") as second:
         url = second.printed("Specimap listens on ")
-        until(lambda: httpx.get(f"{url}/readyz", trust_env=False).json()["workers"] == 1, 20, "the worker")
+        until(
+            lambda: httpx.get(f"{url}/readyz", trust_env=False, verify=NO_TLS).json()["workers"] == 1, 20, "the worker"
+        )
         with Client(url, key) as client:
             assert list(client.jobs.list()) == []
         assert not any(line.startswith("spk_") for line in second.lines)

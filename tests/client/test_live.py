@@ -17,6 +17,7 @@ from specimap_infra.jobs import claim, finish, log, report_progress
 from tests.support.client_scene import Live, connect
 from tests.support.job_scene import EXECUTOR, acquisition
 from tests.support.places import SAMPLES
+from tests.support.plain_http import NO_TLS
 
 # ---- acquisitions -------------------------------------------------------------------------------------
 
@@ -167,7 +168,7 @@ def test_job_is_submitted_followed_and_run_again(live: Live) -> None:
 
 def test_keys_are_made_listed_and_revoked(live: Live) -> None:
     made = live.client.keys.create("tablet 3", ["read"], rate_per_minute=600)
-    with sc.Client(live.service.url, made.key, transport=httpx.HTTPTransport()) as reader:
+    with sc.Client(live.service.url, made.key, transport=httpx.HTTPTransport(verify=NO_TLS)) as reader:
         assert reader.clouds.get(live.result.cloud_id).points
         with pytest.raises(sc.Forbidden) as caught:
             reader.keys.list()
@@ -188,7 +189,7 @@ def test_projects_keep_apart_what_their_keys_make(live: Live) -> None:
     made = administrator.keys.create("tablet 4", ["upload", "read"], project=project)
     assert made.project_id == project.id
     assert [key.id for key in administrator.keys.list(project="study-8")] == [made.id]
-    with sc.Client(live.service.url, made.key, transport=httpx.HTTPTransport()) as other:
+    with sc.Client(live.service.url, made.key, transport=httpx.HTTPTransport(verify=NO_TLS)) as other:
         assert other.projects.list() == [project]
         with pytest.raises(sc.NotFound):
             other.clouds.get(live.result.cloud_id)
@@ -206,7 +207,7 @@ def test_projects_keep_apart_what_their_keys_make(live: Live) -> None:
 def test_rate_limit_is_waited_for(live: Live) -> None:
     key = live.service.key(["read"], rate_per_minute=60)
     started = time.monotonic()
-    with sc.Client(live.service.url, key, transport=httpx.HTTPTransport()) as hasty:
+    with sc.Client(live.service.url, key, transport=httpx.HTTPTransport(verify=NO_TLS)) as hasty:
         for _ in range(62):
             hasty.clouds.get(live.result.cloud_id)
     assert 1.0 < time.monotonic() - started < 30

@@ -25,6 +25,7 @@ from specimap_infra.webhooks import deliver_due, sign, webhook_client
 from tests.support.docs_scene import PAGE, Reader, documents, header
 from tests.support.export_scene import make
 from tests.support.places import SAMPLES
+from tests.support.plain_http import NO_TLS
 from tests.support.result_scene import put_result
 from tests.support.service_scene import serving
 from tests.support.upload_scene import photos, sent
@@ -60,10 +61,10 @@ def keys(reader: Reader) -> None:
     (made,) = documents(reader.sh("Keys"))
     assert made["scopes"] == ["upload", "read"]
     bearer = {"Authorization": f"Bearer {made['key']}"}
-    assert httpx.get(f"{reader.service.url}/v1/jobs", headers=bearer, trust_env=False).status_code == 200
+    assert httpx.get(f"{reader.service.url}/v1/jobs", headers=bearer, trust_env=False, verify=NO_TLS).status_code == 200
     reader.variables["KEY_ID"] = made["id"]
     assert reader.sh("Keys") == ""
-    assert httpx.get(f"{reader.service.url}/v1/jobs", headers=bearer, trust_env=False).status_code == 401
+    assert httpx.get(f"{reader.service.url}/v1/jobs", headers=bearer, trust_env=False, verify=NO_TLS).status_code == 401
 
 
 def projects(reader: Reader) -> None:

@@ -19,10 +19,11 @@ from specimap_infra.projects import DEFAULT_PROJECT
 from specimap_infra.tables import Base
 from specimap_service.auth.dependencies import known_principal
 from specimap_service.auth.object_ids import GUARDS
-from specimap_service.openapi import document
 from specimap_service.uploads.tus_routes import _check_request
 from tests.support.access_scene import CASES, LESSER_SCOPES, OTHERS, make_world
+from tests.support.documented import contract
 from tests.support.job_scene import acquisition, queued_job
+from tests.support.plain_http import NO_TLS
 from tests.support.service_scene import Running, serving
 from tests.support.upload_scene import new_acquisition, photos, sent
 
@@ -36,10 +37,10 @@ def any_service(any_database: str, tmp_path: Path) -> Iterator[Running]:
 
 
 def test_every_operation_has_a_case() -> None:
-    contract = document()
+    described = contract()
     operations = {
         (method.upper(), path): operation
-        for path, methods in contract["paths"].items()
+        for path, methods in described["paths"].items()
         for method, operation in methods.items()
     }
     assert {known for known, operation in operations.items() if not operation.get("security")} == NO_KEY
@@ -290,7 +291,7 @@ def test_projects_are_named_and_renamed(any_service: Running) -> None:
     assert (
         administrator.post("/v1/keys", json={"name": "x", "scopes": ["read"]}).json()["project_id"] == DEFAULT_PROJECT
     )
-    with httpx.Client(base_url=any_service.url, trust_env=False) as holder:
+    with httpx.Client(base_url=any_service.url, trust_env=False, verify=NO_TLS) as holder:
         holder.headers["Authorization"] = f"Bearer {key['key']}"
         assert holder.get("/v1/projects").json() == [renamed]
     audited = administrator.get("/v1/audit", params={"target": made["id"]}).json()["items"]

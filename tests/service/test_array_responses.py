@@ -20,6 +20,7 @@ from specimap_core.cloud import Cloud
 from specimap_service.array_responses import ARROW, JSON, NPY
 from tests.support.cloud_scene import FakeCube, counts
 from tests.support.object_store import object_store
+from tests.support.plain_http import NO_TLS
 from tests.support.result_scene import put_label, put_result
 from tests.support.service_scene import Running, serving
 from tests.support.spectra_scene import BANDS, large_cloud, table_of
@@ -156,7 +157,9 @@ def test_many_clients_get_their_own_spectra(reader: httpx.Client, cloud: Cloud) 
 
     def ask(seed: int) -> None:
         rng = np.random.default_rng(seed)
-        with httpx.Client(base_url=reader.base_url, headers=reader.headers, timeout=60, trust_env=False) as own:
+        with httpx.Client(
+            base_url=reader.base_url, headers=reader.headers, timeout=60, trust_env=False, verify=NO_TLS
+        ) as own:
             for _ in range(6):
                 points = rng.integers(0, cloud.n_points, 3)
                 body = {"select": {"indices": points.tolist()}}

@@ -15,6 +15,7 @@ import pytest
 from specimap_service.body_limits import FILES, LARGEST_JSON, LARGEST_SELECTION, SELECTIONS, most_bytes
 from specimap_service.uploads.multipart import LONGEST_HEADER, MOST_HEADERS, MOST_OVERHEAD
 from tests.support.places import SAMPLES
+from tests.support.plain_http import NO_TLS
 from tests.support.service_scene import Running, serving
 from tests.support.upload_scene import client_at, key_in, new_acquisition, process_serving
 
@@ -145,7 +146,7 @@ BODIES = {
 @pytest.mark.slow
 def test_no_body_makes_a_route_fail(shared: Running) -> None:
     headers = {"Authorization": f"Bearer {shared.key()}", "Tus-Resumable": "1.0.0"}
-    with httpx.Client(base_url=shared.url, headers=headers, trust_env=False, timeout=60) as client:
+    with httpx.Client(base_url=shared.url, headers=headers, trust_env=False, verify=NO_TLS, timeout=60) as client:
         for method, path in routes(shared):
             for name, body in BODIES.items():
                 for kind in KINDS:
@@ -184,7 +185,9 @@ def test_memory_stays_while_a_stranger_sends(tmp_path: Path, chunked: bool) -> N
         before, total = peak(), 96 * 1024**2
         pieces = (b"x" * 65536 for _ in range(total // 65536))
         headers = {"Content-Type": "application/octet-stream"} | ({} if chunked else {"Content-Length": str(total)})
-        answer = httpx.post(f"{url}/v1/jobs", content=pieces, headers=headers, trust_env=False, timeout=60)
+        answer = httpx.post(
+            f"{url}/v1/jobs", content=pieces, headers=headers, trust_env=False, verify=NO_TLS, timeout=60
+        )
         assert answer.status_code == 401
         assert peak() - before < total / 4
 
@@ -264,7 +267,7 @@ def test_a_page_of_another_origin_reads_the_refusals(tmp_path: Path) -> None:
     with serving(tmp_path, cors_origins=["https://tablet.example"]) as service:
         origin = {"Origin": "https://tablet.example"}
         asking = {**origin, "Access-Control-Request-Method": "POST", "Access-Control-Request-Headers": "authorization"}
-        with httpx.Client(base_url=service.url, trust_env=False) as stranger:
+        with httpx.Client(base_url=service.url, trust_env=False, verify=NO_TLS) as stranger:
             assert stranger.options("/v1/jobs", headers=asking).status_code == 200
             refused = stranger.post("/v1/jobs", headers=origin, json={})
         assert refused.status_code == 401

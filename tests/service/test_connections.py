@@ -16,6 +16,7 @@ import httpx
 import pytest
 
 from specimap_service.connections import LARGEST_HEAD
+from tests.support.plain_http import NO_TLS
 from tests.support.result_scene import put_result
 from tests.support.service_scene import Running, serving
 
@@ -279,22 +280,22 @@ def test_one_connection_too_many_is_told_so(tmp_path: Path) -> None:
         held = busy(service, 20)
         until(lambda: len(service.server.server_state.tasks) == 20)
         # httpx has sent its request by the time that it reads the refusal.
-        answer = httpx.get(f"{service.url}/healthz", trust_env=False)
+        answer = httpx.get(f"{service.url}/healthz", trust_env=False, verify=NO_TLS)
         assert (answer.status_code, answer.json()["code"]) == (503, "too_many_connections")
         assert answer.headers["retry-after"] == "5"
         assert answer.headers["connection"] == "close"
         for connection in held:
             connection.close()
         until(lambda: not service.connections)
-        assert httpx.get(f"{service.url}/healthz", trust_env=False).status_code == 200
+        assert httpx.get(f"{service.url}/healthz", trust_env=False, verify=NO_TLS).status_code == 200
 
 
 def test_one_address_leaves_places_to_others(tmp_path: Path) -> None:
     with serving(tmp_path, max_connections=20, max_connections_per_address=10) as service:
         held = busy(service, 10)
         until(lambda: len(service.server.server_state.tasks) == 10)
-        assert httpx.get(f"{service.url}/healthz", trust_env=False).status_code == 503
-        other = httpx.HTTPTransport(local_address="127.0.0.2")
+        assert httpx.get(f"{service.url}/healthz", trust_env=False, verify=NO_TLS).status_code == 503
+        other = httpx.HTTPTransport(local_address="127.0.0.2", verify=NO_TLS)
         with httpx.Client(transport=other) as client:
             assert client.get(f"{service.url}/healthz").status_code == 200
         for connection in held:
@@ -319,7 +320,7 @@ def test_who_asks_nothing_keeps_nobody_out(tmp_path: Path, what: str) -> None:
             if b"\r\n\r\n" in HELD[what]:
                 assert held[-1].recv(65536).startswith(b"HTTP/1.1 ")
                 until(lambda: not service.server.server_state.tasks)
-        with httpx.Client(trust_env=False) as client:
+        with httpx.Client(trust_env=False, verify=NO_TLS) as client:
             assert client.get(f"{service.url}/healthz").status_code == 200
         for connection in held:
             connection.close()
@@ -366,7 +367,7 @@ def starved(folder: Path, *arguments: object) -> Iterator[str]:
 
 def up(url: str) -> bool:
     with suppress(httpx.TransportError):
-        return httpx.get(f"{url}/healthz", trust_env=False, timeout=5).status_code == 200
+        return httpx.get(f"{url}/healthz", trust_env=False, verify=NO_TLS, timeout=5).status_code == 200
     return False
 
 

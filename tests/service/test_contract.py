@@ -21,11 +21,12 @@ from specimap_service.contract.description import operations
 from specimap_service.contract.refusals import OWN
 from specimap_service.errors import OverloadedError, RateLimitedError
 from specimap_service.http_status import HTTP_STATUS
-from specimap_service.openapi import document
 from specimap_service.problems import Problem
+from tests.support import documented
 from tests.support.access_scene import CASES
 from tests.support.job_scene import acquisition, queued_job
 from tests.support.places import ROOT, SUPPORT
+from tests.support.plain_http import NO_TLS
 from tests.support.result_scene import put_result
 from tests.support.service_scene import Running
 
@@ -36,7 +37,7 @@ EXAMPLES = 12
 
 @pytest.fixture(scope="module")
 def contract() -> dict[str, Any]:
-    return document()
+    return documented.contract()
 
 
 def resolved(contract: dict[str, Any], part: dict[str, Any]) -> dict[str, Any]:
@@ -52,7 +53,7 @@ def resolved(contract: dict[str, Any], part: dict[str, Any]) -> dict[str, Any]:
 def test_document_is_what_the_app_serves(contract: dict[str, Any], service: Running) -> None:
     written = yaml.safe_load((ROOT / "openapi.yaml").read_text("utf-8"))
     assert written == contract, "run: python -m specimap_service.openapi > openapi.yaml"
-    assert httpx.get(f"{service.url}/openapi.json", trust_env=False).json() == contract
+    assert httpx.get(f"{service.url}/openapi.json", trust_env=False, verify=NO_TLS).json() == contract
     assert contract["openapi"].startswith("3.1.")
 
 
@@ -69,7 +70,7 @@ def test_every_operation_says_what_it_is_and_how_it_refuses(contract: dict[str, 
 
 
 def test_every_operation_but_health_wants_a_key(contract: dict[str, Any], service: Running) -> None:
-    with httpx.Client(base_url=service.url, trust_env=False) as stranger:
+    with httpx.Client(base_url=service.url, trust_env=False, verify=NO_TLS) as stranger:
         for method, path, operation in operations(contract):
             if path in ("/healthz", "/readyz"):
                 continue
@@ -87,7 +88,7 @@ def test_every_operation_but_health_wants_a_key(contract: dict[str, Any], servic
 
 
 def test_pages_of_the_contract_fetch_nothing_from_elsewhere(service: Running) -> None:
-    with httpx.Client(base_url=service.url, trust_env=False) as reader:
+    with httpx.Client(base_url=service.url, trust_env=False, verify=NO_TLS) as reader:
         for page in ("/docs", "/redoc"):
             text = reader.get(page).text
             places = re.findall(r'(?:src|href)="([^"]+)"', text)
@@ -207,7 +208,12 @@ def test_nothing_is_described_that_is_refused(contract: dict[str, Any]) -> None:
 
 def test_servers_lead_to_the_service(contract: dict[str, Any], service: Running) -> None:
     (server,) = contract["servers"]
-    assert httpx.get(httpx.URL(service.url).join(server["url"]).join("healthz"), trust_env=False).status_code == 200
+    assert (
+        httpx.get(
+            httpx.URL(service.url).join(server["url"]).join("healthz"), trust_env=False, verify=NO_TLS
+        ).status_code
+        == 200
+    )
 
 
 def test_events_hold_what_the_contract_says(contract: dict[str, Any], service: Running) -> None:
@@ -276,4 +282,4 @@ def test_generated_requests_are_answered_as_the_contract_says(service: Running, 
         check=False,
     )
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
-    assert httpx.get(f"{service.url}/readyz", trust_env=False).status_code == 200
+    assert httpx.get(f"{service.url}/readyz", trust_env=False, verify=NO_TLS).status_code == 200

@@ -17,8 +17,9 @@ from specimap_infra.database import utc_now
 from specimap_infra.tables import Acquisition, ApiKey, Delivery, Export, Job, Project, RepeatableRequest, Upload
 from specimap_service.contract.description import operations
 from specimap_service.idempotency import KEPT, sweep
-from specimap_service.openapi import document
+from tests.support.documented import contract
 from tests.support.job_scene import acquisition, queued_job
+from tests.support.plain_http import NO_TLS
 from tests.support.result_scene import put_result
 from tests.support.service_scene import Running, serving
 from tests.support.upload_scene import TUS, metadata, new_acquisition
@@ -104,7 +105,7 @@ def made(answer: httpx.Response) -> Any:
 def test_every_operation_that_creates_takes_an_idempotency_key(service: Running, tmp_path: Path) -> None:
     takes = {
         operation["operationId"]
-        for method, _, operation in operations(document())
+        for method, _, operation in operations(contract())
         if any(parameter["name"] == "idempotency-key" for parameter in operation.get("parameters", ()))
     }
     assert takes == set(requests_of(service, tmp_path / "result"))
@@ -147,7 +148,9 @@ def test_a_key_made_again_is_the_same_and_works(service: Running) -> None:
     first, again = (client.post("/v1/keys", json=body, headers=HEADER).json()["key"] for _ in range(2))
     assert first == again
     for key in (first, client.post("/v1/keys", json=body).json()["key"]):
-        answer = httpx.get(f"{service.url}/v1/jobs", headers={"Authorization": f"Bearer {key}"}, trust_env=False)
+        answer = httpx.get(
+            f"{service.url}/v1/jobs", headers={"Authorization": f"Bearer {key}"}, trust_env=False, verify=NO_TLS
+        )
         assert answer.status_code == 200
     secret = first.rpartition("_")[2]
     with service.database.session() as session:

@@ -23,6 +23,7 @@ from specimap_service.auth import keys
 from specimap_service.jobs import events
 from tests.support.databases import postgres_server, postgres_url
 from tests.support.job_scene import EXECUTOR, acquisition, queued_job
+from tests.support.plain_http import NO_TLS
 from tests.support.service_scene import Running, serving
 
 Told = tuple[int, str, dict[str, Any]]
@@ -199,7 +200,7 @@ def test_many_listeners_cost_one_look_into_the_database(service: Running, monkey
             started.wait()
             return [first, *described]
 
-    with ThreadPoolExecutor(listeners) as pool, httpx.Client(trust_env=False) as stranger:
+    with ThreadPoolExecutor(listeners) as pool, httpx.Client(trust_env=False, verify=NO_TLS) as stranger:
         listening = [pool.submit(listen, n) for n in range(listeners)]
         started.wait()
         looks.clear()

@@ -13,11 +13,12 @@ from specimap_infra.database import utc_now
 from specimap_infra.tables import ApiKey
 from specimap_service.auth.rate_limit import RateLimiter
 from specimap_service.errors import RateLimitedError
+from tests.support.plain_http import NO_TLS
 from tests.support.service_scene import Running, serving
 
 
 def test_health_needs_no_key_and_everything_else_does(service: Running) -> None:
-    with httpx.Client(base_url=service.url, trust_env=False) as stranger:
+    with httpx.Client(base_url=service.url, trust_env=False, verify=NO_TLS) as stranger:
         assert stranger.get("/healthz").json()["status"] == "ok"
         assert stranger.get("/readyz").json() == {"status": "ready", "workers": 0}
         for path in ("/v1/keys", "/metrics", "/v1/audit"):
@@ -37,7 +38,7 @@ def test_key_is_shown_once_hashed_at_rest_and_revoked(service: Running) -> None:
     assert all(secret not in line for line in stored.iterdump())
     stored.close()
     assert "key" not in next(k for k in admin.get("/v1/keys").json() if k["id"] == made["id"])
-    with httpx.Client(base_url=service.url, trust_env=False) as holder:
+    with httpx.Client(base_url=service.url, trust_env=False, verify=NO_TLS) as holder:
         holder.headers["Authorization"] = f"Bearer {made['key']}"
         refused = holder.get("/v1/keys")
         assert (refused.status_code, refused.json()["details"]) == (403, {"scope": "admin"})
@@ -49,7 +50,9 @@ def test_key_is_shown_once_hashed_at_rest_and_revoked(service: Running) -> None:
 
 @pytest.mark.parametrize("wrong", ["x", "spk_", "spk_x_y", "nonsense", "spk_" + "0" * 26 + "_" + "0" * 64])
 def test_wrong_keys_are_refused_alike(service: Running, wrong: str) -> None:
-    answer = httpx.get(f"{service.url}/v1/keys", headers={"Authorization": f"Bearer {wrong}"}, trust_env=False)
+    answer = httpx.get(
+        f"{service.url}/v1/keys", headers={"Authorization": f"Bearer {wrong}"}, trust_env=False, verify=NO_TLS
+    )
     assert (answer.status_code, answer.json()["code"]) == (401, "unauthorized")
 
 
@@ -59,7 +62,10 @@ def test_expired_key_is_refused(service: Running) -> None:
     with service.database.session() as session:
         session.execute(sa.update(ApiKey).where(ApiKey.id == made.json()["id"]).values(expires_at=utc_now()))
     answer = httpx.get(
-        f"{service.url}/v1/keys", headers={"Authorization": f"Bearer {made.json()['key']}"}, trust_env=False
+        f"{service.url}/v1/keys",
+        headers={"Authorization": f"Bearer {made.json()['key']}"},
+        trust_env=False,
+        verify=NO_TLS,
     )
     assert answer.status_code == 401
 

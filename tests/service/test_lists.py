@@ -14,10 +14,11 @@ from specimap_infra import jobs
 from specimap_infra.ids import new_id
 from specimap_infra.tables import Delivery, StoredFile
 from specimap_service.contract.description import operations
-from specimap_service.openapi import document
 from tests.support.access_scene import JUDGEMENT
+from tests.support.documented import contract
 from tests.support.job_scene import acquisition, queued_job
 from tests.support.label_files import header, npy
+from tests.support.plain_http import NO_TLS
 from tests.support.result_scene import put_result
 from tests.support.service_scene import Running
 
@@ -96,7 +97,7 @@ def test_every_list_comes_in_pages_in_either_order(service: Running, tmp_path: P
     addresses = full_lists(service, client, tmp_path)
     described = {
         operation["operationId"]: {parameter["name"]: parameter for parameter in operation["parameters"]}
-        for method, _, operation in operations(document())
+        for method, _, operation in operations(contract())
         if method == "get" and re.search(r"\.(list|get_log)", operation["operationId"])
     }
     assert set(described) == set(addresses)
@@ -128,7 +129,7 @@ def test_answers_tell_the_rate_that_is_left(service: Running) -> None:
     refused = client.get("/v1/jobs")
     assert refused.status_code == 429
     assert refused.headers["ratelimit"] == f'"key";r=0;t={refused.headers["retry-after"]}'
-    assert "ratelimit" not in httpx.get(f"{service.url}/healthz", trust_env=False).headers
+    assert "ratelimit" not in httpx.get(f"{service.url}/healthz", trust_env=False, verify=NO_TLS).headers
     assert "ratelimit" in client.head("/v1/jobs").headers
     assert "ratelimit" in client.post("/v1/jobs", json={}).headers
 

@@ -13,6 +13,7 @@ import pytest
 
 from specimap_infra.projects import DEFAULT_PROJECT
 from tests.support.job_scene import queued_job
+from tests.support.plain_http import NO_TLS
 from tests.support.result_scene import Result, put_result
 from tests.support.service_scene import Running, serving
 from tests.support.upload_scene import TUS, create, new_acquisition, photos, sent
@@ -122,7 +123,7 @@ def test_head_of_an_upload_stays_that_of_tus(scene: tuple[Running, Result, dict[
     assert (head.status_code, head.headers["upload-offset"]) == (200, "0")
     assert client.head("/v1/nothing").status_code == 404
     assert client.head("/v1/jobs/x/cancel").status_code == 405
-    with httpx.Client(base_url=service.url, trust_env=False) as stranger:
+    with httpx.Client(base_url=service.url, trust_env=False, verify=NO_TLS) as stranger:
         assert stranger.head("/healthz").status_code == 200
         assert stranger.head("/v1/keys").status_code == 401
 

@@ -16,6 +16,7 @@ from obstore.store import HTTPStore
 from zarr.storage import ObjectStore
 
 from specimap_core.cloud import ARRAYS
+from tests.support.plain_http import NO_TLS
 from tests.support.result_scene import Result, put_label, put_result
 from tests.support.service_scene import Running, serving
 
@@ -109,7 +110,7 @@ def test_the_scope_read_is_needed(service: Running, result: Result) -> None:
     path = f"/v1/clouds/{result.cloud_id}/zarr/zarr.json"
     refused = service.client(("upload", "label")).get(path)
     assert (refused.status_code, refused.json()["details"]) == (403, {"scope": "read"})
-    assert httpx.get(service.url + path, trust_env=False).status_code == 401
+    assert httpx.get(service.url + path, trust_env=False, verify=NO_TLS).status_code == 401
 
 
 HOSTILE = (
@@ -172,7 +173,7 @@ def test_other_keys_are_not_found(service: Running, result: Result, key: str) ->
 def test_pages_of_allowed_origins_may_read_ranges(service: Running, result: Result) -> None:
     path, origin = f"/v1/clouds/{result.cloud_id}/zarr/{SHARD}", {"Origin": "https://viewer.example"}
     asked = {"Access-Control-Request-Method": "GET", "Access-Control-Request-Headers": "authorization, range"}
-    preflight = httpx.options(service.url + path, headers=origin | asked, trust_env=False)
+    preflight = httpx.options(service.url + path, headers=origin | asked, trust_env=False, verify=NO_TLS)
     assert preflight.status_code == 200
     assert {"authorization", "range"} <= set(preflight.headers["access-control-allow-headers"].lower().split(", "))
     answer = service.client(("read",)).get(path, headers=origin | {"Range": "bytes=-20"})

@@ -13,6 +13,7 @@ import httpx
 import pytest
 
 from specimap_client import Client, Cloud, Retries, _retries
+from tests.support.plain_http import NO_TLS
 from tests.support.result_scene import Result, put_result
 from tests.support.service_scene import ALL_SCOPES, Running, serving
 
@@ -167,7 +168,7 @@ def sse(*events: tuple[int, str, dict[str, Any]]) -> Iterator[bytes]:
 
 def connect(service: Running, scopes: Sequence[str] = ALL_SCOPES, **options: object) -> Client:
     """A client with a new key; its transport keeps this machine's proxies out."""
-    return Client(service.url, service.key(scopes), transport=httpx.HTTPTransport(), **options)  # type: ignore[arg-type]
+    return Client(service.url, service.key(scopes), transport=httpx.HTTPTransport(verify=NO_TLS), **options)  # type: ignore[arg-type]
 
 
 @dataclass

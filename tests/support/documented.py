@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import threading
 from functools import cache
 from typing import Any
 
@@ -11,13 +12,27 @@ import httpx
 from specimap_service.contract.description import operations
 from specimap_service.openapi import document
 
+_lock = threading.Lock()
+
+
+@cache
+def _contract() -> dict[str, Any]:
+    return document()
+
+
+def contract() -> dict[str, Any]:
+    """The service's description of itself, made once for this process; nobody changes it."""
+    # Several threads that ask at first would each make it, which takes a second.
+    with _lock:
+        return _contract()
+
 
 @cache
 def _known() -> list[tuple[str, re.Pattern[str], str, dict[str, set[str]]]]:
-    contract = document()
-    answers: dict[str, Any] = contract["components"]["responses"]
+    described = contract()
+    answers: dict[str, Any] = described["components"]["responses"]
     found = []
-    for method, path, operation in operations(contract):
+    for method, path, operation in operations(described):
         codes = {
             status: set(answers[answer["$ref"].rpartition("/")[2]].get("x-codes", ()))
             for status, answer in operation["responses"].items()

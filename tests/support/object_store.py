@@ -8,6 +8,8 @@ from contextlib import contextmanager
 import httpx
 from moto.server import ThreadedMotoServer
 
+from tests.support.plain_http import NO_TLS
+
 
 @contextmanager
 def object_store(bucket: str) -> Iterator[str]:
@@ -17,7 +19,7 @@ def object_store(bucket: str) -> Iterator[str]:
     host, port = server.get_host_and_port()
     endpoint = f"http://{host}:{port}"
     try:
-        httpx.put(f"{endpoint}/{bucket}", trust_env=False).raise_for_status()
+        httpx.put(f"{endpoint}/{bucket}", trust_env=False, verify=NO_TLS).raise_for_status()
         yield endpoint
     finally:
         server.stop()

@@ -32,6 +32,7 @@ from specimap_service.auth.keys import new_key
 from specimap_service.server import server_config
 from tests.support.databases import create_tables
 from tests.support.documented import check_refusal
+from tests.support.plain_http import NO_TLS
 
 ALL_SCOPES = ("upload", "read", "label", "intraoperative", "admin")
 
@@ -81,7 +82,9 @@ class Running:
         """A client with a new key of these scopes; closed with the service."""
         headers = {"Authorization": f"Bearer {self.key(scopes, project=project, **options)}"}
         hooks = {"response": [check_refusal]}
-        client = httpx.Client(base_url=self.url, headers=headers, timeout=60, trust_env=False, event_hooks=hooks)
+        client = httpx.Client(
+            base_url=self.url, headers=headers, timeout=60, trust_env=False, verify=NO_TLS, event_hooks=hooks
+        )
         self.clients.append(client)
         return client
 

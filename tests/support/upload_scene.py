@@ -23,6 +23,7 @@ from specimap_infra.settings import load_settings
 from specimap_service.auth.keys import new_key
 from tests.support.databases import create_tables
 from tests.support.places import SAMPLES
+from tests.support.plain_http import NO_TLS
 
 TUS = {"Tus-Resumable": "1.0.0"}
 OCTETS = "application/offset+octet-stream"
@@ -151,7 +152,11 @@ def key_in(folder: Path) -> str:
 
 def client_at(url: str, key: str, headers: Mapping[str, str] | None = None) -> httpx.Client:
     return httpx.Client(
-        base_url=url, headers={"Authorization": f"Bearer {key}", **(headers or {})}, timeout=60, trust_env=False
+        base_url=url,
+        headers={"Authorization": f"Bearer {key}", **(headers or {})},
+        timeout=60,
+        trust_env=False,
+        verify=NO_TLS,
     )
 
 

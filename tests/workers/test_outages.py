@@ -22,6 +22,7 @@ from specimap_core.pipeline.clock import STAGES
 from tests.support.databases import postgres_url
 from tests.support.gate import Gate
 from tests.support.object_store import object_store
+from tests.support.plain_http import NO_TLS
 from tests.support.scenes import Finished, OnDisk
 from tests.support.serve_scene import running
 from tests.support.service_scene import serving
@@ -122,7 +123,7 @@ def test_a_worker_that_starts_in_an_outage_works_after_it(tmp_path: Path, behind
         url = served.printed("Specimap listens on ")
 
         def workers() -> int:
-            answer = httpx.get(f"{url}/readyz", trust_env=False, timeout=60)
+            answer = httpx.get(f"{url}/readyz", trust_env=False, verify=NO_TLS, timeout=60)
             return int(answer.json()["workers"]) if answer.status_code == 200 else -1
 
         def pids() -> list[int]:

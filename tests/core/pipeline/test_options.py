@@ -15,7 +15,7 @@ from specimap_core.pipeline.options import DEFAULTS, OPTIONS, RunOptions
 from specimap_core.pipeline.settings import PipelineSettings, settings_from
 from specimap_infra.job_schemas import JobSettings
 from specimap_service.acquisitions.routes import AcquisitionRequest
-from specimap_service.openapi import document
+from tests.support.documented import contract
 
 NUMBERS = {name: option.bounds for name, option in OPTIONS.items() if not option.choices}
 CHOICES = {name: option.choices for name, option in OPTIONS.items() if option.choices}
@@ -66,7 +66,7 @@ def test_a_jobs_settings_have_them() -> None:
 
 
 def test_the_contract_lists_what_they_take() -> None:
-    schemas = document()["components"]["schemas"]
+    schemas = contract()["components"]["schemas"]
     fields = dict(schemas["JobSettings"]["properties"])
     for name in OF_THE_ACQUISITION:
         (fields[name],) = [one for one in fields[name]["anyOf"] if one["type"] != "null"]
