@@ -24,20 +24,27 @@ def picture(
 
     Drawn eight times as large in linear light, averaged, blurred, then encoded: as a lens and a sensor do it.
     """
-    fine, cells = 8, 0
-    height, width = shape
-    linear: NDArray[np.float32] = np.full((height * fine, width * fine), 0.75, np.float32)
+    fine = 8
+    averaged: NDArray[np.float32] = np.full(shape, 0.75, np.float32)
     for marker_id, corners in markers.items():
         drawn = cv2.aruco.generateImageMarker(dictionary_named(dictionary), marker_id, 240)
         cells = drawn.shape[0]
+        # Only where the marker lies: all of a large picture, eight times as large, takes gigabytes.
+        low = np.maximum(np.floor(corners.min(0)).astype(int) - 1, 0)
+        high = np.minimum(np.ceil(corners.max(0)).astype(int) + 2, shape[::-1])
+        width, height = high - low
         # The black square ends half a pixel outside the outermost pixels' centres.
         source = np.array([[-0.5, -0.5], [cells - 0.5, -0.5], [cells - 0.5, cells - 0.5], [-0.5, cells - 0.5]])
-        target = (corners + 0.5) * fine - 0.5
+        target = (corners - low + 0.5) * fine - 0.5
         H = cv2.getPerspectiveTransform(source.astype(np.float32), target.astype(np.float32))
-        mask = cv2.warpPerspective(np.ones_like(drawn), H, linear.shape[::-1], flags=cv2.INTER_NEAREST)
-        warped = cv2.warpPerspective(drawn, H, linear.shape[::-1], flags=cv2.INTER_NEAREST)
+        size = int(width) * fine, int(height) * fine
+        mask = cv2.warpPerspective(np.ones_like(drawn), H, size, flags=cv2.INTER_NEAREST)
+        warped = cv2.warpPerspective(drawn, H, size, flags=cv2.INTER_NEAREST)
+        box = averaged[low[1] : high[1], low[0] : high[0]]
+        linear = np.repeat(np.repeat(box, fine, 0), fine, 1)
         linear[mask > 0] = np.where(warped[mask > 0] > 127, 0.75, 0.03)
-    light = cv2.GaussianBlur(cv2.resize(linear, (width, height), interpolation=cv2.INTER_AREA), (0, 0), blur_px)
+        box[:] = cv2.resize(linear, (int(width), int(height)), interpolation=cv2.INTER_AREA)
+    light = cv2.GaussianBlur(averaged, (0, 0), blur_px)
     encoded = np.asarray(srgb_from_linear(light), float) * 255
     encoded = encoded + noise * np.random.default_rng(seed).standard_normal(encoded.shape)
     return np.asarray(np.clip(encoded + 0.5, 0, 255), np.uint8)

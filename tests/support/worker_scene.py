@@ -29,10 +29,11 @@ from specimap_infra.tables import FINAL_STATES, Acquisition, CloudRow, Job, JobE
 from tests.support.databases import create_tables
 from tests.support.places import SUPPORT
 
-HELD = f"{sys.executable} {SUPPORT / 'held_stage.py'}"
+STAGE_SCRIPT = "stage_script.py"
+HELD = f"{sys.executable} {SUPPORT / STAGE_SCRIPT}"
 """The real stages, held at their beginning while a file of their name lies in HOLD_FOLDER."""
-QUICK = f"{sys.executable} {SUPPORT / 'quick_stage.py'}"
-"""Stages that do nothing but leave what the next one looks for."""
+QUICK = f"{HELD} quick"
+"""Stages, held likewise, that do nothing but leave what the next one looks for."""
 
 
 def until(what: Callable[[], Any], seconds: float, why: str) -> Any:

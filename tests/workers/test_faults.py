@@ -1,4 +1,4 @@
-"""Workers and stages that are killed, frozen or poisoned; jobs that are cancelled. The stages are the real ones."""
+"""Workers and stages that are killed, frozen or poisoned; jobs that are cancelled."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from specimap_infra.setbacks import Setbacks
 from specimap_workers.executors import suffix_of
 from specimap_workers.stage_process import SPARES
 from tests.support.scenes import Finished, OnDisk
-from tests.support.worker_scene import Shop, processes_of, shop, until
+from tests.support.worker_scene import QUICK, STAGE_SCRIPT, Shop, processes_of, shop, until
 
 pytestmark = pytest.mark.slow
 
@@ -85,7 +85,7 @@ def test_another_worker_goes_on_from_the_last_finished_stage(yard: Shop, small: 
 def test_a_killed_stage_is_run_again(yard: Shop, small: OnDisk, finished: Finished) -> None:
     acquisition = yard.acquisition(small.photos, small.header)
     holds = {stage: yard.holding(stage) for stage in STAGES}
-    yard.start()
+    yard.start(QUICK, RESULT_FOLDER=str(finished.out))
     job_id = yard.submit(acquisition)
     for stage in STAGES:
         pid = yard.held(stage)
@@ -127,10 +127,13 @@ def test_a_frozen_worker_that_wakes_up_changes_nothing(yard: Shop, small: OnDisk
 
 
 @pytest.mark.usefixtures("no_memory_kills")
-def test_a_job_that_is_killed_more_often_than_it_may_crash_goes_on(yard: Shop, small: OnDisk) -> None:
+def test_a_job_that_is_killed_more_often_than_it_may_crash_goes_on(
+    yard: Shop, small: OnDisk, finished: Finished
+) -> None:
     acquisition = yard.acquisition(small.photos, small.header)
     hold = yard.holding("reconstruct")
-    worker = yard.start()
+    start = partial(yard.start, QUICK, RESULT_FOLDER=str(finished.out))
+    worker = start()
     job_id = yard.submit(acquisition)
     for number in range(yard.settings.starts + 1):
         pid = yard.held("reconstruct")
@@ -138,7 +141,7 @@ def test_a_job_that_is_killed_more_often_than_it_may_crash_goes_on(yard: Shop, s
             os.kill(pid, signal.SIGKILL)
         else:
             worker.kill()
-            worker = yard.start()
+            worker = start()
         until(partial(gone, pid), 5, "the end of the stage's process")
     yard.held("reconstruct")
     setbacks = Setbacks.of(yard.job(job_id).setbacks)
@@ -180,38 +183,37 @@ def test_a_frozen_worker_takes_its_interruption_back(yard: Shop, small: OnDisk) 
 
 
 @pytest.mark.parametrize("victim", ["KILL_WORKER", "KILL_SELF"])
-def test_a_poisoned_job_fails_with_its_reason_and_the_queue_goes_on(tmp_path: Path, small: OnDisk, victim: str) -> None:
+def test_a_poisoned_job_fails_with_its_reason_and_the_queue_goes_on(
+    tmp_path: Path, small: OnDisk, finished: Finished, victim: str
+) -> None:
     with shop(tmp_path / "shop", interruptions=3, starts=3) as yard:
-        assert_poisoned_job_fails(yard, small, victim)
-
-
-def assert_poisoned_job_fails(yard: Shop, small: OnDisk, victim: str) -> None:
-    acquisition = yard.acquisition(small.photos, small.header)
-    poisoned = yard.submit(acquisition)
-    for _ in range(yard.settings.interruptions if victim == "KILL_WORKER" else 1):
-        worker = yard.start(**{victim: "reconstruct"})
-        if victim == "KILL_WORKER":
-            worker.wait(30)
-    healthy = yard.submit(acquisition)
-    if victim == "KILL_WORKER":
-        yard.start()
-    job = yard.ended(poisoned)
-    assert job.state == "failed"
-    assert job.error is not None
-    assert (job.error["code"], job.error["details"]["stage"]) == ("worker_crashed", "reconstruct")
-    assert job.error["details"]["starts"] == 3
-    assert job.error["details"]["cause"] == ("interruptions" if victim == "KILL_WORKER" else "crashes")
-    if victim == "KILL_SELF":
-        assert "SIGSEGV" in job.error["message"]
-        yard.stop()
-        yard.start()
+        start = partial(yard.start, QUICK, RESULT_FOLDER=str(finished.out))
+        acquisition = yard.acquisition(small.photos, small.header)
+        poisoned = yard.submit(acquisition)
+        for _ in range(yard.settings.interruptions if victim == "KILL_WORKER" else 1):
+            worker = start(**{victim: "reconstruct"})
+            if victim == "KILL_WORKER":
+                worker.wait(30)
         healthy = yard.submit(acquisition)
-    assert yard.ended(healthy).state == "succeeded"
+        if victim == "KILL_WORKER":
+            start()
+        job = yard.ended(poisoned)
+        assert job.state == "failed"
+        assert job.error is not None
+        assert (job.error["code"], job.error["details"]["stage"]) == ("worker_crashed", "reconstruct")
+        assert job.error["details"]["starts"] == 3
+        assert job.error["details"]["cause"] == ("interruptions" if victim == "KILL_WORKER" else "crashes")
+        if victim == "KILL_SELF":
+            assert "SIGSEGV" in job.error["message"]
+            yard.stop()
+            start()
+            healthy = yard.submit(acquisition)
+        assert yard.ended(healthy).state == "succeeded"
 
 
-def test_a_cancelled_job_stops_in_every_stage_and_leaves_nothing(yard: Shop, small: OnDisk) -> None:
+def test_a_cancelled_job_stops_in_every_stage_and_leaves_nothing(yard: Shop, small: OnDisk, finished: Finished) -> None:
     acquisition = yard.acquisition(small.photos, small.header)
-    worker = yard.start()
+    worker = yard.start(QUICK, RESULT_FOLDER=str(finished.out))
     for stage in STAGES:
         hold = yard.holding(stage)
         job_id = yard.submit(acquisition)
@@ -227,7 +229,7 @@ def test_a_cancelled_job_stops_in_every_stage_and_leaves_nothing(yard: Shop, sma
     done = yard.submit(acquisition)
     assert yard.ended(done).state == "succeeded"
     # Those that wait for the next stages; no other is left.
-    assert len(processes_of(["held_stage.py", f"\0{worker.pid}\0"])) <= SPARES
+    assert len(processes_of([STAGE_SCRIPT, f"\0{worker.pid}\0"])) <= SPARES
 
 
 LEAVES_A_LINK = """
