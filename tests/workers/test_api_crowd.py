@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -19,7 +19,7 @@ from specimap_client import Client, Retries
 from specimap_infra.projects import DEFAULT_PROJECT
 from specimap_service.auth.keys import new_key
 from tests.support.scenes import Finished, OnDisk
-from tests.support.worker_scene import QUICK, Shop, assert_all_succeed, shop
+from tests.support.worker_scene import QUICK, Shop, assert_all_succeed, shop, until
 
 pytestmark = pytest.mark.slow
 
@@ -34,8 +34,15 @@ def api(yard: Shop, port: int) -> Iterator[Callable[[], None]]:
     command = [sys.executable, "-c", "from specimap_cli import main; main()", "serve", "--no-worker"]
     processes: list[subprocess.Popen[bytes]] = []
 
+    def answers() -> bool:
+        with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1):
+            return True
+        return False
+
     def start() -> None:
         if processes:
+            # One that has not begun to serve yet has nothing to lose.
+            until(answers, 120, "the API")
             processes[-1].kill()
             processes[-1].wait(10)
         processes.append(subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL))
@@ -63,7 +70,7 @@ def test_no_job_is_lost_when_api_and_workers_are_killed_at_random(
         ids: list[str] = []
 
         def submit() -> None:
-            patient = Retries(attempts=60, first_s=0.1, cap_s=1.0)
+            patient = Retries(attempts=200, first_s=0.1, cap_s=1.0)
             with Client(f"http://127.0.0.1:{port}", key, retries=patient) as client:
                 for number in range(JOBS):
                     # The key makes it safe to ask again after an answer that was lost with the API.
