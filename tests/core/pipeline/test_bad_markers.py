@@ -51,7 +51,7 @@ def test_markers_of_another_dictionary(small: OnDisk, tmp_path: Path, given: str
 
 @pytest.mark.slow
 def test_a_layout_of_one_marker_is_refused_at_the_cube(tmp_path: Path) -> None:
-    phantom = phantom_on_disk(tmp_path, replace(SMALL, marker_ids=(5,), bands=4))
+    phantom = phantom_on_disk(tmp_path, replace(SMALL, marker_ids=(5,), photos=8, bands=4))
     refusal = run_refused(phantom.photos, phantom.header, tmp_path / "out")
     assert refusal["code"] == "markers_missing_in_cube"
 

@@ -218,7 +218,10 @@ def test_a_run_states_that_the_specimen_moved_and_how_unsure_its_places_are(
 def blurred(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Report]:
     """A run on photos so blurred that one marker is read in none of them."""
     folder = tmp_path_factory.mktemp("blurred")
-    phantom = phantom_on_disk(folder, PhantomSettings(seed=21, blur_px=1.5, bands=4))
+    settings = PhantomSettings(
+        seed=21, blur_px=1.5, photos=14, cube_rows=256, cube_cols=320, bands=4, mesh_divisions=96
+    )
+    phantom = phantom_on_disk(folder, settings)
     return folder, run_pipeline(Inputs(phantom.photos, phantom.header), folder / "out", PipelineSettings())
 
 
