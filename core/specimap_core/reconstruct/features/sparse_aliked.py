@@ -24,14 +24,13 @@ DIVISOR = 32
 NMS_ROUNDS = 2
 
 
-class SparseAliked(torch.nn.Module):  # type: ignore[misc, unused-ignore]
+class SparseAliked:
     """An ``ALIKED`` of the package in evaluation mode, changed in place, for one image at a time.
 
     It must have been made to find a fixed number of keypoints.
     """
 
     def __init__(self, network: Any) -> None:
-        super().__init__()
         for block in (network.block1, network.block2):
             for k in (1, 2):
                 convolution, norm = f"conv{k}", f"bn{k}"
@@ -40,7 +39,7 @@ class SparseAliked(torch.nn.Module):  # type: ignore[misc, unused-ignore]
         # Channels last: much of the time goes into operations across the channels of each pixel.
         self.network = network.to(memory_format=torch.channels_last)
 
-    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+    def __call__(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """Keypoints (N, 2), x and y in pixels with centres at integers, and their descriptors (N, 128) of unit length.
 
         ``image``: (1, 3, H, W), RGB from 0 to 1.
