@@ -48,6 +48,11 @@ def reference_of(table: str, row: Mapping[Any, Any]) -> Reference | None:
     return Reference(table, key, folder, int(row.get("size") or 0), digest)
 
 
+def column_of(table: str) -> sa.Column[str]:
+    """Return the column of a table that names a file or folder."""
+    return Base.metadata.tables[table].c[COLUMNS[table][0]]
+
+
 def references(session: Session) -> Iterator[Reference]:
     """Yield what the rows of a database of this version's schema refer to."""
     for name in COLUMNS:

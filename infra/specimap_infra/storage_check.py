@@ -16,10 +16,10 @@ from specimap_core.errors import CancelledError, NotFoundError
 from specimap_infra.backup.manifest import Cancelled, Entry, Progress, read_entries, read_manifest
 from specimap_infra.backup.restore import restore_file
 from specimap_infra.database import Database, utc_now
-from specimap_infra.references import PLACES, REMAKEABLE, Reference, references
+from specimap_infra.references import PLACES, REMAKEABLE, Reference, column_of, references
 from specimap_infra.settings import ServiceSettings
 from specimap_infra.storage import Storage, Stored
-from specimap_infra.tables import FINAL_STATES, Artefact, Base, Export, Job, Upload
+from specimap_infra.tables import FINAL_STATES, Base, Export, Job, Upload
 
 SAFE_HOURS = 24.0
 """Age below which a file that no row refers to may be one whose row is about to be written."""
@@ -223,8 +223,9 @@ def _is_there(database: Database, storage: Storage, reference: Reference) -> boo
 
 
 def _is_referred(database: Database, reference: Reference) -> bool:
+    column = column_of(reference.table)
     with database.session() as session:
-        return any(found.key == reference.key for found in references(session))
+        return session.scalar(sa.select(column).where(column == reference.key).limit(1)) is not None
 
 
 def _is_undamaged(database: Database, storage: Storage, reference: Reference) -> bool:
@@ -250,7 +251,6 @@ def _has(storage: Storage, entry: Entry) -> bool:
 
 
 def _forget(database: Database, reference: Reference) -> None:
-    table = Base.metadata.tables[reference.table]
-    column = {"artefacts": Artefact.storage_key, "exports": Export.storage_key}[reference.table]
+    column = column_of(reference.table)
     with database.session() as session:
-        session.execute(sa.delete(table).where(column == reference.key))
+        session.execute(sa.delete(Base.metadata.tables[reference.table]).where(column == reference.key))
