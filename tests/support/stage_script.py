@@ -1,8 +1,8 @@
 """A stage's process for tests: the real one, or with ``quick`` one that leaves what the next stage looks for.
 
 While a file of a stage's name lies in ``HOLD_FOLDER``, the stage waits at its beginning. ``KILL_WORKER`` names a stage
-at whose beginning the worker is killed instead, ``KILL_SELF`` one where it kills itself. The quick one stands in where a
-test is about queues and not about stages: ``RESULT_FOLDER`` is the finished result that it gives, ``STAGE_SECONDS``
+at whose beginning the worker is killed instead, ``KILL_SELF`` one where it kills itself. The quick one stands in where
+a test is about queues and not about stages: ``RESULT_FOLDER`` is the finished result that it gives, ``STAGE_SECONDS``
 how long each stage takes.
 """
 
