@@ -11,7 +11,7 @@ from starlette.middleware.cors import CORSMiddleware
 
 from specimap_core import __version__
 from specimap_infra.settings import ServiceSettings
-from specimap_service import health, idempotency, problems
+from specimap_service import health, problems
 from specimap_service.acquisitions import dependencies as acquisitions
 from specimap_service.acquisitions import file_routes
 from specimap_service.acquisitions import routes as acquisition_routes
@@ -22,7 +22,7 @@ from specimap_service.body_limits import BodyLimits
 from specimap_service.clouds import dependencies as clouds
 from specimap_service.clouds import export_routes, label_routes, preview_routes, spectra_routes, zarr_routes
 from specimap_service.clouds import routes as cloud_routes
-from specimap_service.clouds.spectra import SpectraRequest
+from specimap_service.clouds.spectra_schemas import SpectraRequest
 from specimap_service.compression import Compression
 from specimap_service.context import CONTEXT, AppContext
 from specimap_service.contract.description import describe
@@ -44,7 +44,7 @@ spectrum. Every call but `/healthz` and `/readyz` takes a key: `Authorization: B
 operation does not know is refused. Within `/v1` the contract only grows.
 """
 
-FEATURES = (idempotency.FEATURE, auth.FEATURE, acquisitions.FEATURE, uploads.FEATURE, jobs.FEATURE, clouds.FEATURE)
+FEATURES = (auth.FEATURE, acquisitions.FEATURE, uploads.FEATURE, jobs.FEATURE, clouds.FEATURE)
 """Opened in this order, closed in the reverse one: uploads use the judge of acquisitions."""
 ROUTES = (
     health,

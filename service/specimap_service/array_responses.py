@@ -23,6 +23,7 @@ from specimap_service.errors import NotAcceptableError
 JSON = "application/json"
 ARROW = "application/vnd.apache.arrow.stream"
 NPY = "application/x-npy"
+FLOAT = np.dtype(np.float32)
 OFFERED = (JSON, ARROW, NPY)
 BATCH, BATCH_VALUES = 4096, 2**19
 """Most rows, and most values, that are read, encoded and sent together: what an answer has in memory at a time."""
@@ -193,22 +194,23 @@ def npy_answer(
     read: Callable[[int, int], Array],
     headers: Mapping[str, str] | None = None,
     pace: Pace = AT_ONCE,
+    dtype: np.dtype[Any] = FLOAT,
 ) -> Response:
-    """Answer with a ``.npy`` file of little-endian float32; ``read(start, stop)`` gives its rows.
+    """Answer with a ``.npy`` file, little-endian; ``read(start, stop)`` gives its rows.
 
     It is read as in :func:`arrow_answer`.
     """
-    head = io.BytesIO()
-    np.lib.format.write_array_header_1_0(head, {"descr": "<f4", "fortran_order": False, "shape": shape})
+    head, stored = io.BytesIO(), dtype.newbyteorder("<")
+
+    def raw(start: int, stop: int) -> bytes:
+        return np.ascontiguousarray(read(start, stop), stored).tobytes()
+
+    np.lib.format.write_array_header_1_0(head, {"descr": stored.str, "fortran_order": False, "shape": shape})
     rows, size = shape[0], batch_rows(int(np.prod(shape[1:])))
-    first = _raw(read(0, min(size, rows)))
-    pieces = chain([head.getvalue(), first], (_raw(read(a, b)) for a, b in _batches(rows, size)))
-    length = len(head.getvalue()) + 4 * int(np.prod(shape))
+    first = raw(0, min(size, rows))
+    pieces = chain([head.getvalue(), first], (raw(a, b) for a, b in _batches(rows, size)))
+    length = len(head.getvalue()) + stored.itemsize * int(np.prod(shape))
     return _answer(pieces, rows <= size, NPY, {**(headers or {}), "Content-Length": str(length)}, pace)
-
-
-def _raw(values: Array) -> bytes:
-    return np.ascontiguousarray(values, "<f4").tobytes()
 
 
 # ---- pieces -------------------------------------------------------------------------------------------

@@ -15,14 +15,13 @@ LEVEL = 4
 _GZIP = re.compile(r"(?:^|,)\s*(?:gzip|\*)\s*(?:$|,|;(?!\s*q=0(?:\.0*)?\s*(?:$|,)))", re.IGNORECASE)
 
 
-class _OnlyJson:
+class _OnlyJson(IdentityResponder):
     """A responder that lets everything pass but JSON without a tag.
 
     A tag names bytes: the same one may not stand for compressed and for plain ones. What has a tag is stored, and
     fetched again only when it has changed.
     """
 
-    send: Send
     passes = False
 
     async def send_with_compression(self, message: Message) -> None:
@@ -34,14 +33,14 @@ class _OnlyJson:
         if self.passes:
             await self.send(message)
         else:
-            await super().send_with_compression(message)  # type: ignore[misc]
+            await super().send_with_compression(message)
 
 
 class _Gzip(_OnlyJson, GZipResponder):
     """Compresses."""
 
 
-class _Plain(_OnlyJson, IdentityResponder):
+class _Plain(_OnlyJson):
     """Compresses nothing, but says that it might have."""
 
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
-import io
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path as FilePath
 from typing import Annotated, Any, Literal
@@ -14,12 +11,9 @@ import numpy as np
 import sqlalchemy as sa
 from anyio import to_thread
 from fastapi import APIRouter, Header, Path, Query, Request, Response
-from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
-from starlette.responses import StreamingResponse
 
 from specimap_core.atomic import disk_errors, remove
-from specimap_core.cloud.shards import PointArray
 from specimap_infra.labels import current_labels
 from specimap_infra.tables import LabelVersion
 from specimap_service.array_responses import (
@@ -31,6 +25,7 @@ from specimap_service.array_responses import (
     chosen_type,
     documented_responses,
     json_rows_answer,
+    npy_answer,
 )
 from specimap_service.auth.dependencies import Labeller, Reader
 from specimap_service.auth.keys import Principal
@@ -39,13 +34,12 @@ from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.clouds.label_body import (
     EXAMPLE_TEXT,
     HEADER,
-    LabelClass,
     LabelMetadata,
-    MadeBy,
     most_bytes,
     parse_metadata,
     parse_values,
 )
+from specimap_service.clouds.label_schemas import Label, LabelValues
 from specimap_service.clouds.label_store import Conditions, check_room, delete_label, find_label, no_label, put_label
 from specimap_service.clouds.open_clouds import LabelRecord, OpenClouds
 from specimap_service.context import AppContext, Context
@@ -59,38 +53,7 @@ Version = Annotated[int | None, Query(ge=1, le=10**9, description="By default th
 AfterName = Annotated[str | None, Query(pattern=r"^[a-z0-9_-]{1,64}$", description="Name of the last one seen.")]
 AfterVersion = Annotated[int | None, Query(ge=1, le=10**9, description="Number of the last version seen.")]
 SortByName = Annotated[Literal["name", "-name"], Query(description="By name, forwards or backwards.")]
-_BLOCK = 65536
 _SENT_TOGETHER = 1024 * 1024
-
-
-class Label(BaseModel):
-    """A version of a label layer."""
-
-    model_config = ConfigDict(from_attributes=True)
-
-    cloud_id: str
-    name: str
-    version: int
-    kind: str
-    classes: list[LabelClass]
-    made_by: MadeBy
-    sha256: str = Field(description="Hash of values and metadata: equal content has an equal hash.")
-    created_at: datetime.datetime
-    created_by: str
-    links: dict[str, str]
-
-
-class LabelValues(BaseModel):
-    """The values of a layer, in the order of the cloud's points."""
-
-    cloud_id: str
-    name: str
-    version: int
-    kind: str
-    classes: list[LabelClass]
-    values: list[int] | list[float | None] | list[list[float | None]] = Field(
-        description="One for each point; for probabilities of several classes a list in the order of the classes."
-    )
 
 
 BINARY = {"schema": {"type": "string", "format": "binary"}}
@@ -260,7 +223,7 @@ def get_values(
     with clouds.reading(cloud_id):
         array = clouds.label_array(record)
         if media == NPY:
-            return _npy(array, headers)
+            return npy_answer(array.shape, array.read, headers, dtype=array.dtype)
         if media == ARROW:
             names = [item["name"] for item in row.classes] if len(array.shape) == 2 else ["value"]
             described = {"kind": row.kind, "version": str(row.version)}
@@ -280,20 +243,6 @@ def get_values(
         }
         width = int(np.prod(array.shape[1:]))
         return json_rows_answer(shown, "values", Rows(array.shape[0], width, array.read), headers=headers)
-
-
-def _npy(array: PointArray, headers: dict[str, str]) -> Response:
-    head = io.BytesIO()
-    dtype = array.dtype.newbyteorder("<")
-    np.lib.format.write_array_header_1_0(head, {"descr": dtype.str, "fortran_order": False, "shape": array.shape})
-    length = len(head.getvalue()) + dtype.itemsize * int(np.prod(array.shape))
-
-    def pieces() -> Iterator[bytes]:
-        yield head.getvalue()
-        for start in range(0, array.shape[0], _BLOCK):
-            yield np.ascontiguousarray(array.read(start, min(start + _BLOCK, array.shape[0])), dtype).tobytes()
-
-    return StreamingResponse(pieces(), headers={**headers, "Content-Length": str(length)}, media_type=NPY)
 
 
 @router.delete("/clouds/{cloud_id}/labels/{name}", status_code=204, operation_id="labels.delete")

@@ -32,23 +32,25 @@ from specimap_service.byte_ranges import CACHED, known_to_client
 from specimap_service.clouds.dependencies import CloudsDep, ReadingDep
 from specimap_service.clouds.open_clouds import CloudRecord, OpenClouds
 from specimap_service.clouds.spectra import (
-    JSON_PAGE,
-    MOST_JSON_POINTS,
     MOST_JSON_VALUES,
     MOST_VALUES,
-    PAGE,
-    BandAnswer,
-    Point,
     PointSpectra,
     Selection,
-    SpectraAnswer,
-    SpectraRequest,
     band_numbers,
     columns_of,
     field_values,
     flag_names,
     listed_bands,
     selected,
+)
+from specimap_service.clouds.spectra_schemas import (
+    JSON_PAGE,
+    MOST_JSON_POINTS,
+    PAGE,
+    BandAnswer,
+    Point,
+    SpectraAnswer,
+    SpectraRequest,
 )
 
 router = APIRouter(prefix="/v1", tags=["spectra"])
