@@ -7,6 +7,7 @@ import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy import event
@@ -130,6 +131,12 @@ def database_seconds(engine: sa.Engine | sa.Connection) -> sa.ColumnElement[floa
     if engine.dialect.name == "sqlite":
         return sa.literal_column("((julianday('now') - 2440587.5) * 86400.0)", sa.Float())
     return sa.literal_column("extract(epoch from clock_timestamp())::double precision", sa.Float())
+
+
+def rows_changed(result: sa.Result[Any]) -> int:
+    """Return how many rows an UPDATE or DELETE has changed."""
+    assert isinstance(result, sa.CursorResult)
+    return result.rowcount
 
 
 def utc_now() -> datetime.datetime:

@@ -21,7 +21,7 @@ from sqlalchemy.orm import InstrumentedAttribute, Session, aliased
 
 from specimap_core.atomic import remove
 from specimap_core.errors import SpecimapError
-from specimap_infra.database import Database, utc_now
+from specimap_infra.database import Database, rows_changed, utc_now
 from specimap_infra.logs import logger
 from specimap_infra.schema_version import engine_schema
 from specimap_infra.settings import ServiceSettings
@@ -38,6 +38,7 @@ from specimap_infra.tables import (
     JobEvent,
     LabelVersion,
     Lease,
+    RepeatableRequest,
     Upload,
 )
 
@@ -51,6 +52,8 @@ LEFTOVER_SECONDS = 24 * 3600.0
 LEFTOVER = re.compile(r"^(?:[0-9a-f]{32}|label-[0-9a-f]{32}(?:\.body)?|exp_[\w-]+|restore-[0-9a-f]{32})\.tmp$")
 """Names that our programs give in the scratch folder, which may be shared with others."""
 AUDITED_AS = "service"
+REQUEST_DAYS = 7.0
+"""How long a request with an idempotency key may be sent again: longer than a tablet is without a network."""
 ENDED_WORKFLOWS = ["SUCCESS", "ERROR", "CANCELLED", "MAX_RECOVERY_ATTEMPTS_EXCEEDED"]
 
 Batch = Callable[[datetime.datetime], int]
@@ -95,6 +98,7 @@ class Housekeeping:
             "uploads": (s.keep_upload_days, self._uploads),
             "deliveries": (s.keep_delivery_days, self._deliveries),
             "audit": (s.keep_audit_days, self._audit),
+            "requests": (REQUEST_DAYS, self._requests),
         }
         removed = dict.fromkeys([*rules, "leftovers"], 0)
         for name, (days, batch) in rules.items():
@@ -123,7 +127,7 @@ class Housekeeping:
             if not ids:
                 return 0
             gone = sa.delete(JobEvent).where(JobEvent.job_id.in_(ids), JobEvent.type != "state")
-            return _count(session.execute(gone.execution_options(synchronize_session=False)))
+            return rows_changed(session.execute(gone.execution_options(synchronize_session=False)))
 
     def _workflows(self, before: datetime.datetime) -> int:
         """The engine's rows of what has ended: status, inputs, steps, streams, notifications."""
@@ -151,11 +155,19 @@ class Housekeeping:
     def _audit(self, before: datetime.datetime) -> int:
         return self._rows(AuditEntry.id, AuditEntry.at < before)
 
-    def _rows(self, id: InstrumentedAttribute[str] | InstrumentedAttribute[int], rule: object) -> int:
+    def _requests(self, before: datetime.datetime) -> int:
+        """Names of requests that may be sent again no longer."""
+        name = RepeatableRequest.key_id, RepeatableRequest.name
         with self._database.session() as session:
-            some = sa.select(id).where(rule).limit(BATCH)  # type: ignore[arg-type]
+            some = sa.select(*name).where(RepeatableRequest.created_at < before).limit(BATCH)
+            gone = sa.delete(RepeatableRequest).where(sa.tuple_(*name).in_(some))
+            return rows_changed(session.execute(gone.execution_options(synchronize_session=False)))
+
+    def _rows(self, id: InstrumentedAttribute[str] | InstrumentedAttribute[int], rule: sa.ColumnElement[bool]) -> int:
+        with self._database.session() as session:
+            some = sa.select(id).where(rule).limit(BATCH)
             gone = sa.delete(id.class_).where(id.in_(some))
-            return _count(session.execute(gone.execution_options(synchronize_session=False)))
+            return rows_changed(session.execute(gone.execution_options(synchronize_session=False)))
 
     # ---- rows with files ------------------------------------------------------------------------------
 
@@ -222,10 +234,6 @@ class Housekeeping:
         return len(keys)
 
 
-def _count(result: sa.Result[object]) -> int:
-    return int(result.rowcount)  # type: ignore[attr-defined]
-
-
 def count_rows(session: Session) -> dict[str, int]:
     """Count the rows of what is kept by rule, and of leases."""
     tables: dict[str, sa.FromClause] = {
@@ -236,6 +244,7 @@ def count_rows(session: Session) -> dict[str, int]:
         "exports": Export.__table__,
         "labels": LabelVersion.__table__,
         "leases": Lease.__table__,
+        "requests": RepeatableRequest.__table__,
         "uploads": Upload.__table__,
         "workflows": sa.table("workflow_status", schema=engine_schema(session.get_bind().dialect)),
     }

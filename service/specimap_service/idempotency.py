@@ -2,34 +2,28 @@
 
 from __future__ import annotations
 
-import asyncio
 import datetime
 import hashlib
 import secrets
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, suppress
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar
 
 import sqlalchemy as sa
-from fastapi import FastAPI, Header
+from fastapi import Header
 from pydantic import BaseModel
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
-from specimap_core.errors import SpecimapError
 from specimap_core.json_text import json_text
 from specimap_infra.database import Database, utc_now
-from specimap_infra.logs import logger
+from specimap_infra.housekeeping import REQUEST_DAYS
 from specimap_infra.tables import RepeatableRequest
 from specimap_service.auth.keys import Principal
-from specimap_service.context import CONTEXT, AppContext
 from specimap_service.errors import IdempotencyConflictError
-from specimap_service.feature import Feature
 
-KEPT = datetime.timedelta(days=7)
-"""How long a request may be sent again: longer than a tablet is without a network."""
-SWEEP_SECONDS = 3600.0
+KEPT = datetime.timedelta(days=REQUEST_DAYS)
+"""How long a request may be sent again."""
 IdempotencyKey = Annotated[
     str | None,
     Header(
@@ -127,32 +121,3 @@ class Repeatable:
 
     def _mine(self) -> sa.ColumnElement[bool]:
         return sa.and_(RepeatableRequest.key_id == self.key_id, RepeatableRequest.name == self.name)
-
-
-def sweep(database: Database) -> None:
-    """Forget the requests that are kept no longer."""
-    with database.session() as session:
-        session.execute(sa.delete(RepeatableRequest).where(RepeatableRequest.created_at < utc_now() - KEPT))
-
-
-async def _sweep_forever(context: AppContext) -> None:
-    while True:
-        try:
-            await asyncio.to_thread(sweep, context.database)
-        except SpecimapError:
-            logger().exception("sweeping of idempotency keys failed")
-        await asyncio.sleep(SWEEP_SECONDS)
-
-
-@asynccontextmanager
-async def _running(app: FastAPI) -> AsyncIterator[None]:
-    task = asyncio.create_task(_sweep_forever(CONTEXT.of(app)))
-    try:
-        yield
-    finally:
-        task.cancel()
-        with suppress(asyncio.CancelledError):
-            await task
-
-
-FEATURE = Feature(lambda app, context: None, _running)

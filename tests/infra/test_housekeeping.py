@@ -29,6 +29,7 @@ from specimap_infra.tables import (
     Job,
     JobEvent,
     LabelVersion,
+    RepeatableRequest,
     Upload,
 )
 from tests.support.job_scene import EXECUTOR, acquisition, queued_job
@@ -87,6 +88,19 @@ def job_with_history(database: Database, owner: str, *, ended: bool, webhook: di
 def event_types(database: Database, job_id: str) -> list[str]:
     with database.session() as session:
         return list(session.scalars(sa.select(JobEvent.type).where(JobEvent.job_id == job_id).order_by(JobEvent.seq)))
+
+
+def test_names_of_requests_go_once_they_may_not_be_sent_again(tables: Database, store: Storage) -> None:
+    limit = utc_now() - datetime.timedelta(days=housekeeping.REQUEST_DAYS)
+    with tables.session() as session:
+        for name, minutes in (("older", -1), ("newer", 1)):
+            at = limit + datetime.timedelta(minutes=minutes)
+            row = RepeatableRequest(key_id="k", name=name, request_hash="0", object_id="acq_1", salt="0", created_at=at)
+            session.add(row)
+    assert keeper(tables, store, **NEVER).sweep()["requests"] == 1
+    with tables.session() as session:
+        assert session.scalars(sa.select(RepeatableRequest.name)).all() == ["newer"]
+        assert count_rows(session)["requests"] == 1
 
 
 def test_history_of_ended_jobs_goes_and_that_of_others_stays(tables: Database, store: Storage) -> None:

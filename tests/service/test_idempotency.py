@@ -16,7 +16,7 @@ from specimap_infra import jobs
 from specimap_infra.database import utc_now
 from specimap_infra.tables import Acquisition, ApiKey, Delivery, Export, Job, Project, RepeatableRequest, Upload
 from specimap_service.contract.description import operations
-from specimap_service.idempotency import KEPT, sweep
+from specimap_service.idempotency import KEPT
 from tests.support.documented import contract
 from tests.support.job_scene import acquisition, queued_job
 from tests.support.plain_http import NO_TLS
@@ -186,12 +186,10 @@ def test_requests_are_kept_for_the_stated_time(service: Running) -> None:
 
     first = ask()
     grow_older(KEPT - datetime.timedelta(minutes=1))
-    sweep(service.database)
     assert ask() == first
     grow_older(KEPT + datetime.timedelta(minutes=1))
     second = ask()
     assert second != first
     assert ask() == second
     grow_older(KEPT + datetime.timedelta(minutes=1))
-    sweep(service.database)
     assert count(service, RepeatableRequest) == 0

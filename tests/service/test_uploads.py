@@ -19,6 +19,7 @@ from scipy import io as scipy_io
 
 from specimap_infra.database import utc_now
 from specimap_infra.tables import Upload
+from specimap_service.uploads.sweeping import sweep
 from tests.support.cube_files import random_values
 from tests.support.places import SAMPLES
 from tests.support.service_scene import Running, serving
@@ -192,7 +193,7 @@ def test_expired_uploads_are_swept(tmp_path: Path) -> None:
             session.execute(sa.update(Upload).where(Upload.id.in_(ids)).values(expires_at=utc_now()))
         assert client.head(asked, headers=TUS).status_code == 410
         (folder / "up_stray").write_bytes(b"young")
-        both = [threading.Thread(target=service.app.state.uploads.sweep) for _ in range(2)]
+        both = [threading.Thread(target=sweep, args=(service.app.state.uploads,)) for _ in range(2)]
         for thread in both:
             thread.start()
         for thread in both:

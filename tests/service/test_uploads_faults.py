@@ -21,6 +21,7 @@ from specimap_infra.tables import Upload
 from specimap_service.auth.keys import Principal
 from specimap_service.uploads import tus_store
 from specimap_service.uploads.lifecycle import Uploads
+from specimap_service.uploads.sweeping import sweep
 from tests.support.service_scene import Running
 from tests.support.upload_scene import (
     OCTETS,
@@ -131,7 +132,7 @@ def test_a_process_that_died_after_the_last_byte(service: Running, ask: str) -> 
     elif ask == "sweep":
         with service.database.session() as session:
             session.get_one(Upload, upload_id).expires_at = utc_now()
-        service.app.state.uploads.sweep()
+        sweep(service.app.state.uploads)
     described = result(client, at)
     assert (described["state"], described["file"]["sha256"]) == ("finished", hashlib.sha256(PHOTO).hexdigest())
     (file,) = client.get(f"/v1/acquisitions/{acquisition}/files").json()

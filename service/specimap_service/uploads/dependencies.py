@@ -17,6 +17,7 @@ from specimap_service.context import AppContext
 from specimap_service.feature import Feature
 from specimap_service.uploads.files import UploadFiles
 from specimap_service.uploads.lifecycle import Uploads
+from specimap_service.uploads.sweeping import sweep
 
 SWEEP_SECONDS = 300.0
 UPLOADS = AppState[Uploads]("uploads")
@@ -42,7 +43,7 @@ async def _running(app: FastAPI) -> AsyncIterator[None]:
 async def _sweep_forever(uploads: Uploads) -> None:
     while True:
         try:
-            await asyncio.to_thread(uploads.sweep)
+            await asyncio.to_thread(sweep, uploads)
         except (SpecimapError, OSError):
             logger().exception("sweeping of uploads failed")
         await asyncio.sleep(SWEEP_SECONDS)

@@ -6,24 +6,18 @@ import datetime
 import hashlib
 import os
 import re
-import shutil
-import time
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 
 import sqlalchemy as sa
 from fastapi.concurrency import run_in_threadpool
 from sqlalchemy.orm import Session
 
 from specimap_core.atomic import disk_errors, remove
-from specimap_core.errors import NotFoundError, SpecimapError
-from specimap_infra.database import utc_now
+from specimap_core.errors import NotFoundError
+from specimap_infra.database import rows_changed, utc_now
 from specimap_infra.errors import JobConflictError
-from specimap_infra.housekeeping import sweep_leftovers
 from specimap_infra.ids import new_id
-from specimap_infra.logs import logger
 from specimap_infra.tables import ROLES, Acquisition, StoredFile, Upload
 from specimap_service.acquisitions.capacity import check_count, check_size, locked_acquisition
 from specimap_service.acquisitions.inspection import Arrival
@@ -39,7 +33,6 @@ from specimap_service.idempotency import Repeatable
 from specimap_service.space import check_disks, check_quota
 from specimap_service.uploads.files import UploadFiles
 
-ABANDONED_SECONDS = 3600.0
 FINISH_SECONDS = 60.0
 """How long one process waits for another that finishes the same upload, in addition to the time of the judging."""
 SERVICE = "service"
@@ -227,7 +220,7 @@ class Uploads:
             changed = session.execute(
                 sa.update(Upload).where(Upload.id == upload_id, Upload.state == "open").values(state="terminated")
             )
-            if not changed.rowcount:  # type: ignore[attr-defined]
+            if not rows_changed(changed):
                 raise JobConflictError(
                     "The upload is finished; its file is stored.", advice="Delete the file of the acquisition instead."
                 )
@@ -240,38 +233,9 @@ class Uploads:
             changed = session.execute(
                 sa.update(Upload).where(Upload.id == upload_id, Upload.state == "open").values(state="expired")
             )
-            if changed.rowcount:  # type: ignore[attr-defined]
+            if rows_changed(changed):
                 audit(session, SERVICE, "upload.expire", upload_id)
         self.files.remove(upload_id)
-
-    def sweep(self) -> None:
-        """Expire uploads that are due, and remove files that killed processes left. Processes may do so at once."""
-        with self.context.database.session() as session:
-            rows = session.execute(
-                sa.select(Upload.id, Upload.size, Upload.expires_at).where(Upload.state == "open")
-            ).all()
-        due = [row for row in rows if row.expires_at <= utc_now()]
-        for row in due:
-            if self.files.size(row.id) == row.size:
-                # Whole, but its process died before the file was stored.
-                with suppress(SpecimapError):
-                    self.finish(row.id)
-                continue
-            with suppress(NotFoundError):
-                handle = self.files.try_lock(row.id)
-                if handle is None:  # another request is writing to it
-                    continue
-                os.close(handle)
-            self.expire(row.id)
-        known = {row.id for row in rows}
-        for path in self.files.abandoned(known, ABANDONED_SECONDS):
-            remove(path)
-        judging = self.context.settings.scratch / "judging"
-        for folder in judging.iterdir() if judging.is_dir() else ():
-            _remove_old(folder)
-        sweep_leftovers(self.context.settings, self.context.storage)
-        if due:
-            logger().info("uploads swept", expired=len(due))
 
     def stored_file(self, upload: Upload) -> StoredFile | None:
         """Return the file that an upload became; None before, and after its deletion."""
@@ -310,9 +274,3 @@ def _check_wanted(session: Session, acquisition_id: str, role: str) -> None:
             f"The acquisition has a {'cube' if role == 'cube' else role + ' reference'} already.",
             advice="Delete its files first, then upload another.",
         )
-
-
-def _remove_old(folder: Path) -> None:
-    with suppress(FileNotFoundError):
-        if time.time() - folder.stat().st_mtime > ABANDONED_SECONDS:
-            shutil.rmtree(folder, ignore_errors=True)
