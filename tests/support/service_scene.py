@@ -123,13 +123,13 @@ def serving(folder: Path, *, own_judge: bool = False, **given: object) -> Iterat
 
     ``own_judge``: with judging processes of its own, for tests of these and of settings that concern them.
     """
-    # Requests of a whole suite would bury what a failing test prints.
-    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING))
-    settings = load_settings(**{"data_dir": folder, "log_level": "warning", "min_free_bytes": 0, **given})
     if not structlog.is_configured():
         # The library's own default draws every local variable of a traceback, which takes seconds.
         plain = structlog.dev.ConsoleRenderer(exception_formatter=structlog.dev.plain_traceback)
         structlog.configure(processors=[*SHARED, plain])
+    # Requests of a whole suite would bury what a failing test prints.
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING))
+    settings = load_settings(**{"data_dir": folder, "log_level": "warning", "min_free_bytes": 0, **given})
     database = Database.open(settings.database)
     create_tables(database)
     database.close()
