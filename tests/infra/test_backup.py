@@ -254,7 +254,7 @@ def test_numbers_and_queues_go_on_after_a_restore(
 def test_rows_are_those_of_one_moment(tables: Database, tmp_path: Path) -> None:
     """A job and its event are written together, so no snapshot holds one without the other."""
     settings = load_settings(data_dir=tmp_path)
-    stop = threading.Event()
+    stop, written_one = threading.Event(), threading.Event()
     yard = Shop(settings, {}, tables, Storage.open(settings), tmp_path)
     acquisition = yard.acquisition(*fake_capture(tmp_path / "capture"))
 
@@ -263,10 +263,12 @@ def test_rows_are_those_of_one_moment(tables: Database, tmp_path: Path) -> None:
             job_id = yard.submit(acquisition)
             with tables.session() as session:
                 jobs.request_cancel(session, job_id)
+            written_one.set()
 
     writer = threading.Thread(target=write)
     writer.start()
     try:
+        assert written_one.wait(60)
         for number in range(5):
             written = dump_rows(tables, tmp_path / f"rows-{number}", lambda: False).rows
             assert set(written) == Base.metadata.tables.keys() - {"leases"}

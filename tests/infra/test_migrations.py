@@ -114,7 +114,7 @@ ROWS: dict[str, dict[str, Any]] = {
 @pytest.fixture
 def first(any_database: str, monkeypatch: pytest.MonkeyPatch) -> Database:
     """A database of the first version, with a row in every table, made as that version made it."""
-    database = Database.open(any_database.replace("postgresql://", "postgresql+psycopg://", 1))
+    database = Database.open(sqlalchemy_url(any_database))
     upgrade = command.upgrade
     with monkeypatch.context() as patched:
         patched.setattr(command, "upgrade", lambda config, _: upgrade(config, "0001"))

@@ -18,6 +18,7 @@ from specimap_infra.projects import DEFAULT_PROJECT
 from specimap_infra.schema_version import ENGINE_SCHEMA, known_revisions, revision_of
 from specimap_infra.tables import Project
 from tests.support.backup_scene import specimap
+from tests.support.databases import sqlalchemy_url
 
 STARTER = """
 import logging, sys
@@ -29,10 +30,6 @@ sys.stdin.readline()
 migrate(Database.open(sys.argv[1]))
 """
 """Alembic logs a line for each migration that it runs."""
-
-
-def sqlalchemy_url(url: str) -> str:
-    return url.replace("postgresql://", "postgresql+psycopg://", 1)
 
 
 @pytest.mark.slow
