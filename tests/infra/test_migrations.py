@@ -16,6 +16,7 @@ from specimap_infra.database import Database
 from specimap_infra.migrate import alembic_config, migrate, whole
 from specimap_infra.projects import DEFAULT_PROJECT
 from specimap_infra.tables import Base
+from tests.support.databases import sqlalchemy_url
 
 NOW = "2026-11-01 10:00:00"
 KEYS = {
