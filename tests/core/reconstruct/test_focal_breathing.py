@@ -131,6 +131,7 @@ def test_a_stated_focal_length_does_as_well() -> None:
     assert 1e-5 < error_of(zooms, true).std() < 0.5 * true.std()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", BREATHING_SEEDS)
 def test_poses_come_nearer_to_truth(seed: int) -> None:
     scene = shown(seed, SPREAD)
