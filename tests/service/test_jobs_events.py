@@ -18,6 +18,7 @@ from psycopg import sql
 
 from specimap_infra import jobs
 from specimap_infra.database import Database, utc_now
+from specimap_infra.queue import POLL_SECONDS
 from specimap_infra.tables import ApiKey, Job
 from specimap_service.auth import keys
 from specimap_service.jobs import events
@@ -212,7 +213,7 @@ def test_many_listeners_cost_one_look_into_the_database(service: Running, monkey
         seconds = time.monotonic() - begun
     for seen in described:
         assert [(seq, type) for seq, type, _ in seen] == expected(20)
-    assert len(looks) <= seconds / events.POLL_SECONDS + 4
+    assert len(looks) <= seconds / POLL_SECONDS + 4
     feed: events.JobEvents = service.app.state.job_events
     until(lambda: not feed._channels)
     until(lambda: feed._poller is not None and feed._poller.done())

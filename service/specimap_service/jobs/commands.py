@@ -112,7 +112,7 @@ def _create_once(
         session.add(job)
         session.flush()
         append_event(session, job.id, "state", {"state": "queued", "starts": 0})
-        enqueue(context.queue, session.connection(), JOBS, RUN_JOB, job.id, job.priority)
+        enqueue(context.queue, session, JOBS, RUN_JOB, job.id, job.priority)
         audit(session, key_id, "job.create", job.id, acquisition=job.acquisition_id, rerun_of=job.rerun_of)
         return job.id, job_views(session, [job])[0]
 
