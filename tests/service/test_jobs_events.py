@@ -267,3 +267,15 @@ def test_stream_lives_through_an_outage_of_the_database(tmp_path: Path) -> None:
             server.execute(sql.SQL("ALTER DATABASE {} ALLOW_CONNECTIONS true").format(name))
             work(service.database, job_id, 3)
             assert [(seq, type) for seq, type, _ in described] == expected(3)[1:]
+
+
+@pytest.mark.slow
+def test_events_come_by_notifications_without_any_poll(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(events, "QUIET_SECONDS", 3600.0)
+    with postgres_url() as url, serving(tmp_path, database_url=url) as service:
+        job_id = queued_job(service.database)
+        until(lambda: service.app.state.job_events._listener.listening)
+        with following(service.client(["read"]), job_id) as described:
+            assert next(described)[0] == 1
+            work(service.database, job_id, 20, 0.02)
+            assert [(seq, type) for seq, type, _ in described] == expected(20)[1:]
