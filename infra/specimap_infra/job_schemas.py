@@ -19,7 +19,7 @@ from specimap_core.pipeline.options import (
     Features,
     Method,
 )
-from specimap_infra.tables import PRIORITIES, Acquisition, CloudRow, Job
+from specimap_infra.tables import PRIORITIES, QUEUED, Acquisition, CloudRow, Job
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 PriorityName = Literal["intraoperative", "routine", "research"]
@@ -152,6 +152,6 @@ def queue_positions(session: Session, ids: list[str]) -> dict[str, int]:
     if not ids:
         return {}
     place = sa.func.row_number().over(order_by=(Job.priority, Job.created_at, Job.id)) - 1
-    queued = sa.select(Job.id, place.label("place")).where(Job.state == "queued").subquery()
+    queued = sa.select(Job.id, place.label("place")).where(QUEUED).subquery()
     rows = session.execute(sa.select(queued.c.id, queued.c.place).where(queued.c.id.in_(ids)))
     return {job_id: int(position) for job_id, position in rows}

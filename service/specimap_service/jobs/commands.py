@@ -46,6 +46,7 @@ def new_job(
         _check_priority(principal, PRIORITIES[wanted.priority])
         return Job(
             acquisition_id=acquisition.id,
+            project_id=acquisition.project_id,
             settings=wanted.settings.on(acquisition),
             priority=PRIORITIES[wanted.priority],
             webhook=_checked_webhook(context, wanted.webhook),
@@ -74,6 +75,7 @@ def repeated_job(
         _check_priority(principal, priority)
         return Job(
             acquisition_id=earlier.acquisition_id,
+            project_id=earlier.project_id,
             settings=job_settings({**earlier.settings, **changed}).model_dump(),
             priority=priority,
             webhook=_checked_webhook(context, webhook),
