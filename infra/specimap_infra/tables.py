@@ -155,6 +155,26 @@ class Upload(Base):
     created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now)
     expires_at: Mapped[datetime.datetime] = mapped_column(index=True)
     created_by: Mapped[str] = mapped_column(index=True)
+    received: Mapped[int] = mapped_column(sa.BigInteger, default=0, server_default=sa.text("0"))
+    """Bytes in the storage, where API processes of several machines share uploads."""
+    holder: Mapped[str | None]
+    """The request that writes to it, by a name of its own, until ``held_until``."""
+    held_until: Mapped[float] = mapped_column(default=0.0, server_default=sa.text("0"))
+    """In seconds of the database's clock."""
+    wanted_at: Mapped[float] = mapped_column(default=0.0, server_default=sa.text("0"))
+    """When another request last asked for it, by the same clock."""
+
+
+class UploadPart(Base):
+    """A part of a resumable upload in the storage, where API processes of several machines share uploads."""
+
+    __tablename__ = "upload_parts"
+
+    upload_id: Mapped[str] = mapped_column(sa.ForeignKey("uploads.id", ondelete="CASCADE"), primary_key=True)
+    start: Mapped[int] = mapped_column(sa.BigInteger, primary_key=True)
+    """Its first byte in the file."""
+    size: Mapped[int] = mapped_column(sa.BigInteger)
+    storage_key: Mapped[str]
 
 
 class Job(Base):

@@ -123,6 +123,6 @@ class Reaper:
 
 def burier(settings: ServiceSettings) -> Callable[[str, bool], None]:
     """Make what a supervisor calls with the name of a worker that has ended, and whether it died; it may raise."""
-    database = Database.open(settings.database, pool_size=1)
+    database = Database.open(settings.database, pool_size=1, overflow=2)
     reaper = Reaper(database, queue_client(database.engine))
     return lambda executor, died: reaper.bury(executor, died=died)
