@@ -22,7 +22,7 @@ help:
 	@echo "make test-fast   the same without the tests marked slow"
 	@echo "make lint    formatting (ruff format .), ruff and mypy"
 	@echo "make bench   measure time, memory and accuracy of a run"
-	@echo "make bench-service   measure the service, compared with nginx where it is installed"
+	@echo "make bench-service   measure the service beside nginx and PostgreSQL where they are, and kill its processes"
 	@echo "make check-images    build and run the images of docker/ without Docker (needs root and the network)"
 	@echo "make clean   remove $(VENV) and out/"
 
@@ -72,6 +72,7 @@ bench: setup
 
 bench-service: setup
 	$(RUN)/python -m bench.service
+	$(RUN)/python -m bench.faults --jobs 8 --minutes 10
 
 check-images:
 	docker/check_images.sh

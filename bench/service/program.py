@@ -1,4 +1,4 @@
-"""``python -m bench.service [--only spectrum|cloud|shard|upload|jobs|neighbour] [--repeats N] [--jobs N]``."""
+"""``python -m bench.service [--only spectrum|cloud|shard|upload|jobs|neighbour|scale] [--repeats N] [--jobs N]``."""
 
 from __future__ import annotations
 
@@ -12,11 +12,15 @@ from rich.console import Console
 
 from bench.machine import describe, in_words
 from bench.record import keep
+from bench.service.databases import postgres_version
 from bench.service.options import Options
 from bench.service.parts import PARTS
 from bench.service.peer import NO_NGINX, NO_TILED, nginx_version, tiled_version
 
-PACKAGES = ("fastapi", "starlette", "uvicorn", "uvloop", "httptools", "dbos", "sqlalchemy", "zarr", "obstore", "httpx")
+PACKAGES = (
+    *("fastapi", "starlette", "uvicorn", "uvloop", "httptools", "dbos", "sqlalchemy", "psycopg"),
+    *("zarr", "obstore", "httpx"),
+)
 WIDTH = 130
 """Columns where the output is not a terminal."""
 
@@ -27,7 +31,9 @@ def machine() -> dict[str, object]:
     versions = found["versions"]
     assert isinstance(versions, dict)
     found["versions"] = (
-        versions | {name: version(name) for name in PACKAGES} | {"nginx": nginx_version(), "tiled": tiled_version()}
+        versions
+        | {name: version(name) for name in PACKAGES}
+        | {"nginx": nginx_version(), "tiled": tiled_version(), "postgresql": postgres_version()}
     )
     return found
 

@@ -7,15 +7,17 @@ import re
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 
 from specimap_client import Client
 from specimap_infra.settings import ServiceSettings, load_settings
 
 START_SECONDS = 60
+NO_SETTINGS: Mapping[str, str] = MappingProxyType({})
 TICKS = os.sysconf("SC_CLK_TCK")
 COMMAND = (sys.executable, "-c", "from specimap_cli import main; main()", "serve")
 
@@ -28,6 +30,8 @@ class Served:
     key: str
     pid: int
     folder: Path
+    given: dict[str, str] = field(default_factory=dict)
+    """Settings besides those of everybody."""
 
     @property
     def address(self) -> tuple[str, int]:
@@ -43,7 +47,7 @@ class Served:
     @property
     def settings(self) -> ServiceSettings:
         """Of the same database and storage."""
-        return load_settings(data_dir=self.folder)
+        return load_settings(data_dir=self.folder, **self.given)
 
     def client(self) -> Client:
         """A client with that key."""
@@ -72,9 +76,9 @@ class Served:
 
 
 @contextmanager
-def serving(folder: Path, *, worker: bool = False) -> Iterator[Served]:
+def serving(folder: Path, *, worker: bool = False, given: Mapping[str, str] = NO_SETTINGS) -> Iterator[Served]:
     """Serve from a new folder until the block ends, with the settings that a person gets who sets none, but for the
-    rate limit, which a benchmark would meet. The log goes to ``service.log`` in the folder.
+    rate limit, which a benchmark would meet, and those ``given``. The log goes to ``service.log`` in the folder.
 
     Raises:
         RuntimeError: it does not start; with the end of its log.
@@ -82,6 +86,7 @@ def serving(folder: Path, *, worker: bool = False) -> Iterator[Served]:
     folder.mkdir(parents=True)
     environment = {name: value for name, value in os.environ.items() if not name.startswith("SPECIMAP_")}
     environment |= {"SPECIMAP_DATA_DIR": str(folder), "SPECIMAP_PORT": "0", "SPECIMAP_RATE_PER_MINUTE": str(10**9)}
+    environment |= {f"SPECIMAP_{name.upper()}": value for name, value in given.items()}
     log = folder / "service.log"
     with open(log, "wb") as errors:
         process = subprocess.Popen(
@@ -106,7 +111,7 @@ def serving(folder: Path, *, worker: bool = False) -> Iterator[Served]:
         if url is None or key is None:
             process.wait()
             raise RuntimeError(f"specimap serve does not start:\n{printed}{log.read_text(encoding='utf-8')[-2000:]}")
-        yield Served(url[1], key[0], process.pid, folder)
+        yield Served(url[1], key[0], process.pid, folder, dict(given))
     finally:
         hung.cancel()
         process.terminate()

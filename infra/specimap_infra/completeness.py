@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import PurePosixPath
+from typing import Protocol
 
 import sqlalchemy as sa
 from sqlalchemy.orm import Session
@@ -15,16 +17,42 @@ HEADER, DATA = ".hdr", ".raw"
 """Suffixes of a cube in two files; a file with any other suffix is a whole cube."""
 
 
+class FileRow(Protocol):
+    """What counts of a file: its row, or these columns of it."""
+
+    @property
+    def role(self) -> str:
+        """Role."""
+
+    @property
+    def label(self) -> str:
+        """Name in results."""
+
+    @property
+    def state(self) -> str:
+        """``accepted`` or ``refused``."""
+
+
+def files_of(session: Session, acquisitions: list[str]) -> dict[str, list[FileRow]]:
+    """Return the files of each acquisition, by one query; an acquisition without any has an empty list."""
+    files = sa.select(StoredFile.acquisition_id, StoredFile.role, StoredFile.label, StoredFile.state)
+    found: dict[str, list[FileRow]] = {acquisition: [] for acquisition in acquisitions}
+    for row in session.execute(files.where(StoredFile.acquisition_id.in_(acquisitions))):
+        found[row.acquisition_id].append(row)
+    return found
+
+
 def missing(session: Session, acquisition_id: str) -> list[str]:
     """Return a sentence for each missing file; empty where a job can run. Refused files do not count."""
-    accepted = session.execute(
-        sa.select(StoredFile.role, StoredFile.label).where(
-            StoredFile.acquisition_id == acquisition_id, StoredFile.state == "accepted"
-        )
-    )
+    return missing_of(files_of(session, [acquisition_id])[acquisition_id])
+
+
+def missing_of(files: Iterable[FileRow]) -> list[str]:
+    """Do as :func:`missing` does with the files of one acquisition."""
     labels: dict[str, set[str]] = {}
-    for role, label in accepted:
-        labels.setdefault(role, set()).add(label)
+    for file in files:
+        if file.state == "accepted":
+            labels.setdefault(file.role, set()).add(file.label)
     sentences = []
     photos = len(labels.get("photo", ()))
     if photos < LEAST_PHOTOS:

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import psycopg
 import sqlalchemy as sa
 from sqlalchemy import event
 from sqlalchemy.exc import DBAPIError, OperationalError
@@ -17,14 +18,22 @@ from sqlalchemy.orm import Session, sessionmaker
 from specimap_core.atomic import disk_errors
 from specimap_infra.availability import Availability
 from specimap_infra.errors import DatabaseDamagedError, DatabaseUnavailableError
-from specimap_infra.postgres import make_postgres_engine
+from specimap_infra.notifications import send
+from specimap_infra.postgres import BoundedConnection, make_postgres_engine
 from specimap_infra.private_files import make_private
 
 DAMAGED = (sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_CORRUPT)
 
 
-def make_engine(url: str, *, pool_size: int = 10) -> sa.Engine:
-    """Make an engine for the SQLAlchemy URL, on which writers queue and a dead server is noticed."""
+POOL_SIZE = 10
+OVERFLOW = 20
+
+
+def make_engine(url: str, *, pool_size: int = POOL_SIZE, overflow: int = OVERFLOW) -> sa.Engine:
+    """Make an engine for the SQLAlchemy URL, on which writers queue and a dead server is noticed.
+
+    It keeps up to ``pool_size`` connections open, and opens up to ``overflow`` more while all are in use.
+    """
     parsed = sa.make_url(url)
     if parsed.get_backend_name() == "sqlite":
         if parsed.database:
@@ -32,7 +41,7 @@ def make_engine(url: str, *, pool_size: int = 10) -> sa.Engine:
             with disk_errors(path.parent):
                 path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
                 make_private(path)
-        engine = sa.create_engine(parsed, pool_size=pool_size, max_overflow=20)
+        engine = sa.create_engine(parsed, pool_size=pool_size, max_overflow=overflow)
 
         @event.listens_for(engine, "connect")
         def _set_up(connection: object, _: object) -> None:
@@ -42,7 +51,7 @@ def make_engine(url: str, *, pool_size: int = 10) -> sa.Engine:
                 connection.execute(f"PRAGMA {pragma}")  # type: ignore[attr-defined]
 
         return engine
-    return make_postgres_engine(parsed, pool_size=pool_size)
+    return make_postgres_engine(parsed, pool_size=pool_size, overflow=overflow)
 
 
 class Database:
@@ -55,24 +64,42 @@ class Database:
         self._sessions = sessionmaker(engine, expire_on_commit=False)
 
     @classmethod
-    def open(cls, url: str, *, pool_size: int = 10) -> Database:
-        """Open without connecting yet."""
-        return cls(make_engine(url, pool_size=pool_size))
+    def open(cls, url: str, *, pool_size: int = POOL_SIZE, overflow: int = OVERFLOW) -> Database:
+        """Open without connecting yet, with connections as :func:`make_engine` says."""
+        return cls(make_engine(url, pool_size=pool_size, overflow=overflow))
 
     @contextmanager
     def session(self) -> Iterator[Session]:
         """Open a transaction: committed at the end of the block, rolled back if it raises.
 
+        What :func:`specimap_infra.notifications.tell` was told in it is sent once it is committed.
+
         Raises:
             DatabaseUnavailableError: the server cannot be reached.
         """
-        with (
-            self._availability.trying(_is_away),
-            database_errors(),
-            self._sessions() as session,
-            session.begin(),
-        ):
-            yield session
+        with self._availability.trying(_is_away), database_errors(), self._sessions() as session:
+            with session.begin():
+                yield session
+            send(session)
+
+    @contextmanager
+    def apart(self) -> Iterator[BoundedConnection]:
+        """Open a connection of its own to a PostgreSQL, outside of the pool and of transactions, for what waits long.
+
+        Raises:
+            DatabaseUnavailableError: the server cannot be reached, also later in the block.
+        """
+        with self._availability.trying(_is_away), database_errors():
+            pooled = self.engine.raw_connection()
+        driver = pooled.driver_connection
+        pooled.detach()
+        assert isinstance(driver, BoundedConnection)
+        try:
+            with driver:
+                driver.autocommit = True
+                yield driver
+        except psycopg.Error as error:
+            raise _unavailable(error) from error
 
     def check(self) -> None:
         """Raise DatabaseUnavailableError if the database does not answer."""

@@ -111,12 +111,26 @@ class Housekeeping:
             except Exception:
                 # What one rule meets must not keep the others from their work.
                 logger().exception("housekeeping failed", rule=name)
+        try:
+            self._assign()
+        except SpecimapError as error:
+            logger().warning("housekeeping failed", rule="projects", code=error.code)
         removed["leftovers"] = sweep_leftovers(s, self._storage)
         if any(removed.values()):
             logger().info("swept", **removed)
         return removed
 
     # ---- rows -----------------------------------------------------------------------------------------
+
+    def _assign(self) -> None:
+        """Give rows their project that a program of a release before schema 0006 has written since the upgrade."""
+        for table in (Job, CloudRow):
+            owner = sa.select(Acquisition.project_id).where(Acquisition.id == table.acquisition_id).scalar_subquery()
+            with self._database.session() as session:
+                session.execute(
+                    sa.update(table).where(table.project_id == "").values(project_id=owner),
+                    execution_options={"synchronize_session": False},
+                )
 
     def _events(self, before: datetime.datetime) -> int:
         """Progress and log lines of jobs that ended; changes of state stay, and with them the last event."""

@@ -19,8 +19,10 @@ from specimap_core.pipeline.options import (
     Features,
     Method,
 )
-from specimap_infra.tables import PRIORITIES, Acquisition, CloudRow, Job
+from specimap_infra.tables import PRIORITIES, QUEUED, Acquisition, CloudRow, Job
 
+FEW = 4
+"""Jobs up to which each one's place in the queue is counted for itself."""
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 PriorityName = Literal["intraoperative", "routine", "research"]
 
@@ -149,9 +151,22 @@ def job_views(session: Session, jobs: list[Job]) -> list[JobView]:
 
 def queue_positions(session: Session, ids: list[str]) -> dict[str, int]:
     """How many queued jobs come before each of these, by priority, then age."""
-    if not ids:
-        return {}
+    if len(ids) <= FEW:
+        return {job_id: _queue_position(session, job_id) for job_id in ids}
     place = sa.func.row_number().over(order_by=(Job.priority, Job.created_at, Job.id)) - 1
-    queued = sa.select(Job.id, place.label("place")).where(Job.state == "queued").subquery()
+    queued = sa.select(Job.id, place.label("place")).where(QUEUED).subquery()
     rows = session.execute(sa.select(queued.c.id, queued.c.place).where(queued.c.id.in_(ids)))
     return {job_id: int(position) for job_id, position in rows}
+
+
+def _queue_position(session: Session, job_id: str) -> int:
+    """Count those before one job, which takes no sorting of all."""
+    job = session.get_one(Job, job_id)
+    place = sa.tuple_(Job.priority, Job.created_at, Job.id)
+    own = sa.tuple_(
+        *(
+            sa.literal(value, column.type)
+            for column, value in ((Job.priority, job.priority), (Job.created_at, job.created_at), (Job.id, job.id))
+        )
+    )
+    return session.scalar(sa.select(sa.func.count()).select_from(Job).where(QUEUED, place < own)) or 0

@@ -18,6 +18,7 @@ from specimap_core.json_text import json_ready
 from specimap_infra.database import database_seconds, utc_now
 from specimap_infra.errors import JobConflictError, LostLeaseError
 from specimap_infra.ids import new_id
+from specimap_infra.notifications import DELIVERIES, JOB_EVENTS, tell
 from specimap_infra.setbacks import Setbacks
 from specimap_infra.tables import FINAL_STATES, CloudRow, Delivery, Export, Job, JobEvent
 
@@ -248,6 +249,7 @@ def _change(
         event["cloud_id"] = session.scalar(sa.select(CloudRow.id).where(CloudRow.job_id == job.id))
         if job.webhook is not None:
             session.add(Delivery(id=new_id("dlv"), job_id=job.id, state="pending"))
+            tell(session, DELIVERIES)
     else:
         # The stage stays: it shows in which one workers die, if they do.
         job.executor, job.progress = executor, 0.0
@@ -261,6 +263,7 @@ def _append(session: Session, job: Job, type: EventType, data: dict[str, Any]) -
     last = session.scalar(sa.select(sa.func.max(JobEvent.seq)).where(JobEvent.job_id == job.id)) or 0
     session.add(JobEvent(job_id=job.id, seq=last + 1, type=type, data=json_ready(data)))
     session.flush()
+    tell(session, JOB_EVENTS, job.id)
     return last + 1
 
 

@@ -63,12 +63,12 @@ class BoundedConnection(psycopg.Connection[Any]):
             self.answer_seconds = ANSWER_SECONDS
 
 
-def make_postgres_engine(url: sa.URL, *, pool_size: int) -> sa.Engine:
+def make_postgres_engine(url: sa.URL, *, pool_size: int, overflow: int) -> sa.Engine:
     """Make an engine of such connections."""
     engine = sa.create_engine(
         url,
         pool_size=pool_size,
-        max_overflow=20,
+        max_overflow=overflow,
         pool_timeout=CONNECT_SECONDS,
         pool_pre_ping=True,
         connect_args=CONNECT_ARGUMENTS,

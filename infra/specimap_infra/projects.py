@@ -1,7 +1,7 @@
 """Projects: to which one each object belongs.
 
 A key and an acquisition name their project. Everything else belongs to the project of its acquisition, whoever made it,
-so that an acquisition and its results are never divided.
+so that an acquisition and its results are never divided; jobs and clouds hold a copy of its name, for lists.
 """
 
 from __future__ import annotations
@@ -69,19 +69,20 @@ def project_of(session: Session, object_id: str) -> str | None:
 
 
 def within(table: type[Base], projects: sa.Select[str] | str) -> sa.ColumnElement[bool]:
-    """Make the condition that rows of a table belong to a project, or to one of several."""
+    """Make the condition that rows of a table belong to a project, given by its id or a query for one id."""
+    # Not `in`, with which SQLite would sort all that a large project has for each page.
+    wanted = projects if isinstance(projects, str) else projects.scalar_subquery()
 
     def is_one(column: Any) -> sa.ColumnElement[bool]:
-        found: sa.ColumnElement[bool] = column == projects if isinstance(projects, str) else column.in_(projects)
+        found: sa.ColumnElement[bool] = column == wanted
         return found
 
     if table is Project:
         return is_one(Project.id)
     columns: Any = table
-    if table in (Acquisition, ApiKey, AuditEntry):
+    if table in (Acquisition, ApiKey, AuditEntry, Job, CloudRow):
         return is_one(columns.project_id)
-    # An alias, since the query may have acquisitions too. Not `in`, which SQLite would begin with: it would then sort
-    # all that a large project has for each page.
+    # An alias, since the query may have acquisitions too.
     owner = aliased(Acquisition)
     return sa.exists().where(owner.id == columns.acquisition_id, is_one(owner.project_id))
 

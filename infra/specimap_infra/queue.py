@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import sqlalchemy as sa
 from dbos import DBOSClient, DBOSPortableJSONSerializer, WorkflowSerializationFormat
+from sqlalchemy.orm import Session
+
+from specimap_infra.notifications import QUEUED, tell
 
 JsonSerializer = DBOSPortableJSONSerializer
 """Inputs and outputs are stored as JSON; a pickle in a database is a program."""
@@ -17,6 +20,14 @@ APPLICATION = "specimap"
 APPLICATION_VERSION = "1"
 """Fixed: by default it is a hash of the code, and a new version would never run the jobs of an old one."""
 POLL_SECONDS = 0.25
+"""How often SQLite, which notifies nobody, is asked for what is new."""
+QUIET_SECONDS = 10.0
+"""How often PostgreSQL is, in case that a notification was lost."""
+
+
+def poll_seconds(engine: sa.Engine) -> float:
+    """Return how often who waits for something new asks the database."""
+    return POLL_SECONDS if engine.dialect.name == "sqlite" else QUIET_SECONDS
 
 
 def queue_client(engine: sa.Engine) -> DBOSClient:
@@ -30,10 +41,10 @@ def queue_client(engine: sa.Engine) -> DBOSClient:
     )
 
 
-def enqueue(client: DBOSClient, connection: sa.Connection, queue: str, workflow: str, id: str, priority: int) -> None:
+def enqueue(client: DBOSClient, session: Session, queue: str, workflow: str, id: str, priority: int) -> None:
     """Enqueue within the caller's transaction, so that a row and its workflow exist together or not at all."""
     client.enqueue_in_transaction(
-        connection,
+        session.connection(),
         {
             "workflow_name": workflow,
             "queue_name": queue,
@@ -46,3 +57,4 @@ def enqueue(client: DBOSClient, connection: sa.Connection, queue: str, workflow:
         },
         id,
     )
+    tell(session, QUEUED, queue)

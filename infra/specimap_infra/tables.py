@@ -15,6 +15,8 @@ FINAL_STATES = ("succeeded", "failed", "cancelled")
 PRIORITIES = {"intraoperative": 1, "routine": 5, "research": 9}
 SCOPES = ("upload", "read", "label", "intraoperative", "admin")
 ROLES = ("photo", "cube", "white", "dark")
+QUEUED = sa.text("state = 'queued'")
+"""Condition of the index of queued jobs. A query uses that index where it has the state as text too, not as a value."""
 
 
 class UtcDateTime(sa.types.TypeDecorator[datetime.datetime]):
@@ -49,6 +51,18 @@ class Base(DeclarativeBase):
             "pk": "pk_%(table_name)s",
         }
     )
+
+
+def _project_of_acquisition(context: Any) -> str:
+    """Give a new row the project of its acquisition, which never changes."""
+    acquisition_id = context.get_current_parameters()["acquisition_id"]
+    query = sa.select(Acquisition.project_id).where(Acquisition.id == acquisition_id)
+    return context.connection.scalar(query) or ""
+
+
+def _in_project() -> Any:
+    """A copy of the acquisition's, for lists: an index in their order finds the few rows of a small project."""
+    return mapped_column(default=_project_of_acquisition, server_default=sa.text("''"))
 
 
 def _owned_by(table: str, **options: Any) -> Any:
@@ -141,16 +155,41 @@ class Upload(Base):
     created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now)
     expires_at: Mapped[datetime.datetime] = mapped_column(index=True)
     created_by: Mapped[str] = mapped_column(index=True)
+    received: Mapped[int] = mapped_column(sa.BigInteger, default=0, server_default=sa.text("0"))
+    """Bytes in the storage, where API processes of several machines share uploads."""
+    holder: Mapped[str | None]
+    """The request that writes to it, by a name of its own, until ``held_until``."""
+    held_until: Mapped[float] = mapped_column(default=0.0, server_default=sa.text("0"))
+    """In seconds of the database's clock."""
+    wanted_at: Mapped[float] = mapped_column(default=0.0, server_default=sa.text("0"))
+    """When another request last asked for it, by the same clock."""
+
+
+class UploadPart(Base):
+    """A part of a resumable upload in the storage, where API processes of several machines share uploads."""
+
+    __tablename__ = "upload_parts"
+
+    upload_id: Mapped[str] = mapped_column(sa.ForeignKey("uploads.id", ondelete="CASCADE"), primary_key=True)
+    start: Mapped[int] = mapped_column(sa.BigInteger, primary_key=True)
+    """Its first byte in the file."""
+    size: Mapped[int] = mapped_column(sa.BigInteger)
+    storage_key: Mapped[str]
 
 
 class Job(Base):
     """A run of the pipeline on an acquisition. ``id`` is the workflow's id at the job engine too."""
 
     __tablename__ = "jobs"
-    __table_args__ = (sa.UniqueConstraint("created_by", "idempotency_key"),)
+    __table_args__ = (
+        sa.UniqueConstraint("created_by", "idempotency_key"),
+        sa.Index("ix_jobs_project_id", "project_id", "id"),
+        sa.Index("ix_jobs_queued", "priority", "created_at", "id", postgresql_where=QUEUED, sqlite_where=QUEUED),
+    )
 
     id: Mapped[str] = mapped_column(primary_key=True)
     acquisition_id: Mapped[str] = _owned_by("acquisitions")
+    project_id: Mapped[str] = _in_project()
     settings: Mapped[dict[str, Any]]
     priority: Mapped[int]
     state: Mapped[str] = mapped_column(index=True)
@@ -226,10 +265,12 @@ class CloudRow(Base):
     """A finished result: a folder ``prefix`` in the storage with cloud.zarr, mesh.ply, report.json and others."""
 
     __tablename__ = "clouds"
+    __table_args__ = (sa.Index("ix_clouds_project_id", "project_id", "id"),)
 
     id: Mapped[str] = mapped_column(primary_key=True)
     job_id: Mapped[str] = _owned_by("jobs", unique=True)
     acquisition_id: Mapped[str] = _owned_by("acquisitions")
+    project_id: Mapped[str] = _in_project()
     prefix: Mapped[str]
     points: Mapped[int]
     bands: Mapped[int]

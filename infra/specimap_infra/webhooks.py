@@ -102,6 +102,13 @@ def deliver_due(database: Database, settings: ServiceSettings, client: httpx.Cli
     return MOST_AT_ONCE
 
 
+def seconds_to_next(database: Database, most: float) -> float:
+    """Return how long until a delivery is due, at most ``most``. Raises DatabaseUnavailableError."""
+    with database.session() as session:
+        next_at = session.scalar(sa.select(sa.func.min(Delivery.next_at)).where(Delivery.state == "pending"))
+    return most if next_at is None else min(most, (next_at - utc_now()).total_seconds())
+
+
 def _claim(database: Database, now: datetime.datetime) -> _Claimed | None:
     due = sa.and_(Delivery.state == "pending", Delivery.next_at <= now)
     while True:

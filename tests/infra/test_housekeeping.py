@@ -63,7 +63,7 @@ def job_with_history(database: Database, owner: str, *, ended: bool, webhook: di
     """A job with its workflow, progress and log lines; one that has ended did so long ago."""
     job_id, client = queued_job(database, owner, webhook), queue_client(database.engine)
     with database.session() as session:
-        enqueue(client, session.connection(), JOBS, RUN_JOB, job_id, 5)
+        enqueue(client, session, JOBS, RUN_JOB, job_id, 5)
     with database.session() as session:
         jobs.claim(session, job_id, EXECUTOR)
         jobs.report_progress(session, job_id, EXECUTOR, "render", 0.5)

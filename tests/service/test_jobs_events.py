@@ -18,6 +18,7 @@ from psycopg import sql
 
 from specimap_infra import jobs
 from specimap_infra.database import Database, utc_now
+from specimap_infra.queue import POLL_SECONDS
 from specimap_infra.tables import ApiKey, Job
 from specimap_service.auth import keys
 from specimap_service.jobs import events
@@ -213,7 +214,7 @@ def test_many_listeners_cost_one_look_into_the_database(service: Running, monkey
         seconds = time.monotonic() - begun
     for seen in described:
         assert [(seq, type) for seq, type, _ in seen] == expected(20)
-    assert len(looks) <= seconds / events.POLL_SECONDS + 4
+    assert len(looks) <= seconds / POLL_SECONDS + 4
     feed: events.JobEvents = service.app.state.job_events
     until(lambda: not feed._channels)
     until(lambda: feed._poller is not None and feed._poller.done())
@@ -267,3 +268,15 @@ def test_stream_lives_through_an_outage_of_the_database(tmp_path: Path) -> None:
             server.execute(sql.SQL("ALTER DATABASE {} ALLOW_CONNECTIONS true").format(name))
             work(service.database, job_id, 3)
             assert [(seq, type) for seq, type, _ in described] == expected(3)[1:]
+
+
+@pytest.mark.slow
+def test_events_come_by_notifications_without_any_poll(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(events, "QUIET_SECONDS", 3600.0)
+    with postgres_url() as url, serving(tmp_path, database_url=url) as service:
+        job_id = queued_job(service.database)
+        until(lambda: service.app.state.job_events._listener.listening)
+        with following(service.client(["read"]), job_id) as described:
+            assert next(described)[0] == 1
+            work(service.database, job_id, 20, 0.02)
+            assert [(seq, type) for seq, type, _ in described] == expected(20)[1:]

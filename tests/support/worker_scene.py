@@ -118,7 +118,7 @@ class Shop:
                 )
             )
             session.flush()
-            enqueue(client, session.connection(), JOBS, RUN_JOB, job_id, priority)
+            enqueue(client, session, JOBS, RUN_JOB, job_id, priority)
         return job_id
 
     def job(self, job_id: str) -> Job:

@@ -147,6 +147,7 @@ class JobRun:
             id=new_id("cloud"),
             job_id=job.id,
             acquisition_id=job.acquisition_id,
+            project_id=job.project_id,
             prefix=outcome["prefix"],
             points=report.coverage.points,
             bands=outcome["bands"],

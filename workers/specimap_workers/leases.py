@@ -6,6 +6,7 @@ and the jobs' rows refuse what a worker writes that has lost its lease.
 
 from __future__ import annotations
 
+import random
 import threading
 import time
 from collections.abc import Callable
@@ -18,12 +19,16 @@ from specimap_infra.errors import DatabaseUnavailableError
 from specimap_infra.logs import logger
 from specimap_infra.tables import Lease
 
+LOOKING = 4
+"""How many workers, of any number, look after the others in the time of one heartbeat."""
+
 
 class LeaseKeeper:
     """Renews one worker's lease in a thread, and looks after others.
 
-    At every heartbeat ``look_after`` gets the executors that live, or None while it is too early to judge others by
-    their leases; ``settle`` is called once a lease.
+    At a heartbeat ``look_after`` gets the executors that live, or None while it is too early to judge others by their
+    leases; ``settle`` is called once a lease. Of many workers only some do either at a time: what one finds grows with
+    their number, so what all find would grow with its square.
     """
 
     def __init__(
@@ -75,9 +80,14 @@ class LeaseKeeper:
                 if steady is None or now - renewed > self._ttl:
                     steady = now
                 renewed = now
-                judging = now - steady >= self._ttl
-                self._look_after(self._living() if judging else None)
-                if judging and now - settled >= self._ttl:
+                if now - steady < self._ttl:
+                    self._look_after(None)
+                    continue
+                living = self._living()
+                if random.random() * len(living) > LOOKING:
+                    continue
+                self._look_after(living)
+                if now - settled >= self._ttl:
                     settled = now
                     self._settle()
             except DatabaseUnavailableError:

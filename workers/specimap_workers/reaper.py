@@ -13,6 +13,7 @@ from specimap_infra import jobs
 from specimap_infra.database import Database, database_errors, utc_now
 from specimap_infra.errors import WorkerCrashedError
 from specimap_infra.logs import logger
+from specimap_infra.notifications import QUEUED, tell
 from specimap_infra.queue import queue_client
 from specimap_infra.setbacks import Setbacks
 from specimap_infra.settings import ServiceSettings
@@ -69,6 +70,8 @@ class Reaper:
             queue = str(workflow.queue_name)
             if self._client._sys_db.reenqueue_for_recovery(workflow.workflow_id, [executor], queue):
                 logger().warning("work taken over", job=workflow.workflow_id, executor=executor)
+                with self._database.session() as session:
+                    tell(session, QUEUED, queue)
 
     def bury(self, executor: str, *, died: bool = True) -> None:
         """Hand over the work of an executor whose process has ended for certain, and remove its lease."""
@@ -120,6 +123,6 @@ class Reaper:
 
 def burier(settings: ServiceSettings) -> Callable[[str, bool], None]:
     """Make what a supervisor calls with the name of a worker that has ended, and whether it died; it may raise."""
-    database = Database.open(settings.database, pool_size=1)
+    database = Database.open(settings.database, pool_size=1, overflow=2)
     reaper = Reaper(database, queue_client(database.engine))
     return lambda executor, died: reaper.bury(executor, died=died)

@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from typing import Any, Self
 
+import httpx
 from dbos import DBOS, DBOSConfig
 
 from specimap_core.errors import SpecimapError
@@ -18,6 +19,7 @@ from specimap_infra.errors import DatabaseUnavailableError, LostLeaseError
 from specimap_infra.housekeeping import Housekeeping
 from specimap_infra.logs import logger
 from specimap_infra.migrate import migrate
+from specimap_infra.notifications import DELIVERIES, QUEUED, Listener
 from specimap_infra.queue import (
     APPLICATION,
     APPLICATION_VERSION,
@@ -25,24 +27,30 @@ from specimap_infra.queue import (
     JOBS,
     MAKE_EXPORT,
     POLL_SECONDS,
+    QUIET_SECONDS,
     RUN_JOB,
     JsonSerializer,
+    poll_seconds,
     queue_client,
 )
 from specimap_infra.settings import ServiceSettings
 from specimap_infra.storage import Storage
-from specimap_infra.webhooks import deliver_due, webhook_client
+from specimap_infra.webhooks import deliver_due, seconds_to_next, webhook_client
 from specimap_workers.executors import suffix_of
 from specimap_workers.exports import run_export
 from specimap_workers.job import STAGES, JobRun
 from specimap_workers.leases import LeaseKeeper
 from specimap_workers.presence import Presence
+from specimap_workers.queue_threads import QueueThreads, quieten_engine
 from specimap_workers.reaper import Reaper
 from specimap_workers.stage_process import COMMAND, Processes
 from specimap_workers.workspaces import Workspaces
 
 DELIVERY_SECONDS = 1.0
 SWEEP_SECONDS = 15.0
+STOP_SECONDS = 0.25
+POOL = {"pool_size": 2, "overflow": 6}
+"""Of the worker's own connections, and of the engine's; docs/hospital-it.md adds them up."""
 
 
 class Worker:
@@ -60,8 +68,11 @@ class Worker:
         self.settings = settings
         self._backends = backends
         self.executor = executor
-        self._database = Database.open(settings.database)
+        self._database = Database.open(settings.database, **POOL)
         self._storage = Storage.open(settings)
+        self._listener = Listener(self._database, (QUEUED, DELIVERIES), self._told)
+        self._threads: QueueThreads | None = None
+        self._to_deliver = threading.Event()
         work = settings.scratch / "work"
         self._presence = Presence(work, self.executor)
         self._reaper = Reaper(self._database, queue_client(self._database.engine))
@@ -104,7 +115,7 @@ class Worker:
         self._look_after(None)
         self._sweep()
         self._register()
-        self._configure()
+        engine = self._configure()
         keeper = LeaseKeeper(
             self._database,
             self.executor,
@@ -118,12 +129,18 @@ class Worker:
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: self._stopping.set())
         DBOS.listen_queues([JOBS, EXPORTS])
+        quieten_engine()
         with database_errors():
             DBOS.launch()
-            for queue in (JOBS, EXPORTS):
+            polling = poll_seconds(self._database.engine)
+            queues = [
                 DBOS.register_queue(
-                    queue, worker_concurrency=1, polling_interval_sec=POLL_SECONDS, on_conflict="always_update"
+                    queue, worker_concurrency=1, polling_interval_sec=polling, on_conflict="always_update"
                 )
+                for queue in (JOBS, EXPORTS)
+            ]
+        self._threads = QueueThreads(engine, queues, lambda: self._listener.listening)
+        self._listener.start()
         logger().info("worker started", executor=self.executor)
         housekeeping = Housekeeping(self._database, self._storage, self.settings, queue_client(self._database.engine))
         housekeeping.start()
@@ -138,23 +155,45 @@ class Worker:
                 logger().warning("jobs not handed over yet: the database is away", executor=self.executor)
             keeper.stop()
             housekeeping.stop()
+            self._listener.stop()
             logger().info("worker stopped", executor=self.executor)
+
+    def _told(self, channel: str, payload: str) -> None:
+        """Look for what a notification tells of."""
+        if channel == QUEUED:
+            self._look_for_more(payload)
+        if channel == DELIVERIES:
+            self._to_deliver.set()
 
     def _deliver_until_stopped(self) -> None:
         with webhook_client() as client:
-            swept = time.monotonic()
-            while not self._stopping.wait(DELIVERY_SECONDS):
-                if time.monotonic() - swept > SWEEP_SECONDS:
-                    swept = time.monotonic()
+            swept = looked = time.monotonic()
+            wait = DELIVERY_SECONDS
+            while not self._stopping.is_set():
+                # Not a wait for the end: its signal may come within the wait, and would wait for the wait's lock.
+                told = self._to_deliver.wait(STOP_SECONDS)
+                now = time.monotonic()
+                if now - swept > SWEEP_SECONDS:
+                    swept = now
                     self._sweep()
-                try:
-                    deliver_due(self._database, self.settings, client)
-                except DatabaseUnavailableError:
-                    pass  # they are delivered once it is back; the log tells that it is away
-                except SpecimapError as error:
-                    logger().warning("webhooks not delivered", code=error.code)
+                if told or now - looked >= wait:
+                    looked = now
+                    self._to_deliver.clear()
+                    wait = self._deliver(client)
 
-    def _configure(self) -> None:
+    def _deliver(self, client: httpx.Client) -> float:
+        """Deliver what is due; return how many seconds to wait before the next look."""
+        try:
+            deliver_due(self._database, self.settings, client)
+            if self._listener.listening:
+                return max(DELIVERY_SECONDS, seconds_to_next(self._database, QUIET_SECONDS))
+        except DatabaseUnavailableError:
+            pass  # they are delivered once it is back; the log tells that it is away
+        except SpecimapError as error:
+            logger().warning("webhooks not delivered", code=error.code)
+        return DELIVERY_SECONDS
+
+    def _configure(self) -> DBOS:
         config: DBOSConfig = {
             "name": APPLICATION,
             "system_database_url": self._database.engine.url.render_as_string(hide_password=False),
@@ -169,8 +208,8 @@ class Worker:
         }
         if self._database.engine.dialect.name != "sqlite":
             # Of its own, since it holds connections for long; with limits to its waits, which the engine's have not.
-            config["system_database_engine"] = make_engine(self.settings.database)
-        DBOS(config=config)
+            config["system_database_engine"] = make_engine(self.settings.database, **POOL)
+        return DBOS(config=config)
 
     def _register(self) -> None:
         """Declare the workflows. Their first act is not a step: the worker that takes a job over must claim it anew."""
@@ -197,6 +236,7 @@ class Worker:
                 return "lost"
             finally:
                 job.clear()
+                self._look_for_more(JOBS)
 
         @DBOS.workflow(name=MAKE_EXPORT, max_recovery_attempts=None)
         async def make_export(export_id: str) -> str:
@@ -213,9 +253,14 @@ class Worker:
                 )
             finally:
                 stop.set()
+                self._look_for_more(EXPORTS)
             return "done"
 
         self._workflows = run_job, make_export, stage_step
+
+    def _look_for_more(self, queue: str) -> None:
+        if self._threads is not None:
+            self._threads.wake(queue)
 
     def _job(self, job_id: str) -> JobRun:
         return JobRun(

@@ -241,11 +241,11 @@ def _fill(database: Database, rows: Path, manifest: Manifest) -> None:
                     jobs.set_state(session, job.id, "queued")
                 # What stopped it was not the job.
                 job.starts, job.setbacks = 0, {}
-                enqueue(client, session.connection(), JOBS, RUN_JOB, job.id, job.priority)
+                enqueue(client, session, JOBS, RUN_JOB, job.id, job.priority)
             unmade = sa.select(Export).where(Export.state.not_in(FINAL_STATES)).order_by(Export.created_at, Export.id)
             for export in session.scalars(unmade).all():
                 export.state, export.executor, export.setbacks = "queued", None, {}
-                enqueue(client, session.connection(), EXPORTS, MAKE_EXPORT, export.id, PRIORITIES["routine"])
+                enqueue(client, session, EXPORTS, MAKE_EXPORT, export.id, PRIORITIES["routine"])
             # Their bytes were in the scratch folder of the machine that was saved.
             session.execute(sa.update(Upload).where(Upload.state == "open").values(state="expired"))
             session.flush()

@@ -11,12 +11,12 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, StringConstraints
 from sqlalchemy.orm import Session
 
 from specimap_core.pipeline.options import DEFAULTS, Dictionary
-from specimap_infra.completeness import missing
+from specimap_infra.completeness import FileRow, files_of, missing_of
 from specimap_infra.database import utc_now
 from specimap_infra.errors import JobConflictError
 from specimap_infra.ids import new_id
 from specimap_infra.job_schemas import EdgeMm
-from specimap_infra.tables import FINAL_STATES, Acquisition, Job, StoredFile, Upload
+from specimap_infra.tables import FINAL_STATES, Acquisition, Job, Upload
 from specimap_service.acquisitions.capacity import locked_acquisition
 from specimap_service.acquisitions.dependencies import JudgeDep, UnfinishedUploadsDep
 from specimap_service.acquisitions.schemas import FileCounts, counts
@@ -137,7 +137,7 @@ def list_acquisitions(
     query = paged(query, Acquisition.id, after, limit, sort)
     with context.database.session() as session:
         rows = list(session.scalars(query))
-        views = [_view(session, row) for row in rows]
+        views = _views(session, rows)
     return page_of(views, [row.id for row in rows], limit)
 
 
@@ -186,8 +186,16 @@ def check_idle(session: Session, acquisition_id: str) -> None:
 
 
 def _view(session: Session, row: Acquisition) -> AcquisitionView:
-    stored = session.scalars(sa.select(StoredFile).where(StoredFile.acquisition_id == row.id))
-    lacking = missing(session, row.id)
+    return _views(session, [row])[0]
+
+
+def _views(session: Session, rows: list[Acquisition]) -> list[AcquisitionView]:
+    files = files_of(session, [row.id for row in rows])
+    return [_with_files(row, files[row.id]) for row in rows]
+
+
+def _with_files(row: Acquisition, files: list[FileRow]) -> AcquisitionView:
+    lacking = missing_of(files)
     return AcquisitionView(
         id=row.id,
         project_id=row.project_id,
@@ -198,7 +206,7 @@ def _view(session: Session, row: Acquisition) -> AcquisitionView:
         notes=row.notes,
         created_at=row.created_at,
         created_by=row.created_by,
-        files=counts(stored),
+        files=counts(files),
         ready=not lacking,
         missing=lacking,
     )

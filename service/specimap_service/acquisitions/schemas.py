@@ -9,8 +9,7 @@ from typing import Annotated, Literal
 from fastapi import Path
 from pydantic import BaseModel, ConfigDict, Field
 
-from specimap_infra.completeness import DATA, HEADER
-from specimap_infra.tables import StoredFile
+from specimap_infra.completeness import DATA, HEADER, FileRow
 
 Role = Literal["photo", "cube", "white", "dark"]
 VerdictName = Literal["accepted", "doubtful", "refused"]
@@ -93,7 +92,7 @@ class FileCounts(BaseModel):
     dark: bool
 
 
-def counts(files: Iterable[StoredFile]) -> FileCounts:
+def counts(files: Iterable[FileRow]) -> FileCounts:
     """Count the files of one acquisition."""
     rows = list(files)
     accepted = [row for row in rows if row.state == "accepted"]

@@ -120,7 +120,7 @@ def _made(
         )
         session.add(row)
         session.flush()
-        enqueue(context.queue, session.connection(), EXPORTS, MAKE_EXPORT, row.id, PRIORITIES["routine"])
+        enqueue(context.queue, session, EXPORTS, MAKE_EXPORT, row.id, PRIORITIES["routine"])
         audit(session, principal.key_id, "export.create", row.id, cloud=cloud_id, format=format.value)
     return row, replaced
 

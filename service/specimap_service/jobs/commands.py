@@ -46,6 +46,7 @@ def new_job(
         _check_priority(principal, PRIORITIES[wanted.priority])
         return Job(
             acquisition_id=acquisition.id,
+            project_id=acquisition.project_id,
             settings=wanted.settings.on(acquisition),
             priority=PRIORITIES[wanted.priority],
             webhook=_checked_webhook(context, wanted.webhook),
@@ -74,6 +75,7 @@ def repeated_job(
         _check_priority(principal, priority)
         return Job(
             acquisition_id=earlier.acquisition_id,
+            project_id=earlier.project_id,
             settings=job_settings({**earlier.settings, **changed}).model_dump(),
             priority=priority,
             webhook=_checked_webhook(context, webhook),
@@ -112,7 +114,7 @@ def _create_once(
         session.add(job)
         session.flush()
         append_event(session, job.id, "state", {"state": "queued", "starts": 0})
-        enqueue(context.queue, session.connection(), JOBS, RUN_JOB, job.id, job.priority)
+        enqueue(context.queue, session, JOBS, RUN_JOB, job.id, job.priority)
         audit(session, key_id, "job.create", job.id, acquisition=job.acquisition_id, rerun_of=job.rerun_of)
         return job.id, job_views(session, [job])[0]
 

@@ -15,6 +15,7 @@ from specimap_infra import tables
 from specimap_infra.errors import JobConflictError
 from specimap_infra.ids import new_id
 from specimap_infra.jobs import locked
+from specimap_infra.notifications import DELIVERIES, tell
 from specimap_infra.tables import FINAL_STATES
 from specimap_infra.webhooks import check_target
 from specimap_service.auth.access import not_found
@@ -85,6 +86,7 @@ def create_delivery(
         row = tables.Delivery(id=new_id("dlv"), job_id=job_id, state="pending")
         session.add(row)
         session.flush()
+        tell(session, DELIVERIES)
         audit(session, principal.key_id, "job.notify", job_id, delivery=row.id)
         return row.id, Delivery.model_validate(row)
 

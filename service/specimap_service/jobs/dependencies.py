@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from typing import Annotated
 
 from fastapi import Depends, FastAPI
@@ -14,8 +16,6 @@ from specimap_service.feature import Feature
 from specimap_service.jobs.events import JobEvents, Streams
 
 EVENTS = AppState[JobEvents]("job_events")
-
-
 STREAMS = AppState[Streams]("streams")
 
 
@@ -24,12 +24,22 @@ def _open(app: FastAPI, context: AppContext) -> None:
     STREAMS.set(app, Streams(context.settings.max_streams_per_key))
 
 
+@asynccontextmanager
+async def _running(app: FastAPI) -> AsyncIterator[None]:
+    events = EVENTS.of(app)
+    events.start()
+    try:
+        yield
+    finally:
+        await asyncio.to_thread(events.stop)
+
+
 async def _place(principal: Reader, streams: Annotated[Streams, Depends(STREAMS.of_request)]) -> AsyncIterator[None]:
     with streams.place(principal.key_id):
         yield
 
 
-FEATURE = Feature(_open)
+FEATURE = Feature(_open, _running)
 EventsDep = Annotated[JobEvents, Depends(EVENTS.of_request)]
 StreamPlace = Annotated[None, Depends(_place)]
 """One of the streams that the request's key may follow, held until the answer has ended."""

@@ -1,4 +1,7 @@
-"""Events of jobs for many listeners, with one query to the database for all of them."""
+"""Events of jobs for many listeners, with one query to the database for all of them.
+
+PostgreSQL notifies of new events. SQLite is asked four times a second, and so is PostgreSQL while nobody can listen.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +18,13 @@ from sqlalchemy.orm import Session
 from specimap_infra.database import Database
 from specimap_infra.errors import DatabaseUnavailableError
 from specimap_infra.logs import logger
+from specimap_infra.notifications import JOB_EVENTS, Listener
+from specimap_infra.queue import POLL_SECONDS, QUIET_SECONDS
 from specimap_infra.tables import FINAL_STATES, Job, JobEvent
 from specimap_service.errors import RateLimitedError
 
-POLL_SECONDS = 0.25
+PAUSE_SECONDS = 0.01
+"""Pause after a notification, for others to come: a look finds what all of them tell of."""
 KEEP_ALIVE_SECONDS = 15.0
 RETRY_SECONDS = 1.0
 """How long to wait before a database that did not answer is queried again."""
@@ -102,7 +108,35 @@ class JobEvents:
         self._database = database
         self._channels: dict[str, _Channel] = {}
         self._poller: asyncio.Task[None] | None = None
-        self._joined = asyncio.Event()
+        self._listener = Listener(database, (JOB_EVENTS,), self._told)
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._wanted: set[str] = set()
+        """Jobs to look at before the next poll."""
+        self._look = asyncio.Event()
+
+    def start(self) -> None:
+        """Listen to notifications, where there are any; from the event loop."""
+        self._loop = asyncio.get_running_loop()
+        self._listener.start()
+
+    def stop(self) -> None:
+        """End listening; from a thread."""
+        self._listener.stop()
+
+    def _told(self, _: str, job_id: str) -> None:
+        """Pass a notification on to the event loop, from the listener's thread."""
+        if self._loop is not None:
+            with suppress(RuntimeError):  # the loop has ended
+                self._loop.call_soon_threadsafe(self._want, job_id)
+
+    def _want(self, job_id: str) -> None:
+        """Look at a job that has listeners before the next poll; at all of them where the id is empty."""
+        if job_id in self._channels:
+            self._wanted.add(job_id)
+        elif not job_id:
+            self._wanted |= set(self._channels)
+        if self._wanted:
+            self._look.set()
 
     async def follow(self, job_id: str, after: int, check: Check) -> AsyncGenerator[Event | None]:
         """Yield events after number ``after`` as they occur, and None now and then while nothing happens.
@@ -151,7 +185,7 @@ class JobEvents:
     def _listening(self, job_id: str, after: int) -> Iterator[_Channel]:
         if job_id not in self._channels:
             self._channels[job_id] = _Channel(after)
-            self._joined.set()
+            self._want(job_id)
         channel = self._channels[job_id]
         channel.listeners += 1
         if self._poller is None or self._poller.done():
@@ -164,10 +198,17 @@ class JobEvents:
                 del self._channels[job_id]
 
     async def _poll(self) -> None:
+        clock = asyncio.get_running_loop().time
+        looked_at_all = -QUIET_SECONDS
         while self._channels:
-            heads = {job_id: channel.head for job_id, channel in self._channels.items()}
+            # Before the look: what is told of during it may be too late for it.
+            wanted, self._wanted = self._wanted, set()
+            self._look.clear()
+            if not wanted or clock() - looked_at_all >= QUIET_SECONDS:
+                wanted, looked_at_all = set(self._channels), clock()
+            heads = {job_id: channel.head for job_id, channel in self._channels.items() if job_id in wanted}
             found: dict[str, list[Event]] = {}
-            wait = POLL_SECONDS
+            wait = QUIET_SECONDS if self._listener.listening else POLL_SECONDS
             try:
                 found = await asyncio.to_thread(read_events, self._database, heads)
             except DatabaseUnavailableError:
@@ -185,10 +226,10 @@ class JobEvents:
                 await self._wait(wait)
 
     async def _wait(self, seconds: float) -> None:
-        """Wait, but only until a job gets its first listener."""
-        self._joined.clear()
+        """Wait, but only until there is a job to look at."""
         with suppress(TimeoutError):
-            await asyncio.wait_for(self._joined.wait(), seconds)
+            await asyncio.wait_for(self._look.wait(), seconds)
+            await asyncio.sleep(PAUSE_SECONDS)
 
     async def _over(self, job_id: str, seq: int) -> bool:
         """Return whether no event can come after number ``seq``."""

@@ -15,8 +15,9 @@ from specimap_service.acquisitions.dependencies import INTAKE, JUDGE, UNFINISHED
 from specimap_service.app_state import AppState
 from specimap_service.context import AppContext
 from specimap_service.feature import Feature
-from specimap_service.uploads.files import UploadFiles
+from specimap_service.uploads.files import UploadBytes, UploadFiles
 from specimap_service.uploads.lifecycle import Uploads
+from specimap_service.uploads.parts import UploadParts
 from specimap_service.uploads.sweeping import sweep
 
 SWEEP_SECONDS = 300.0
@@ -24,9 +25,17 @@ UPLOADS = AppState[Uploads]("uploads")
 
 
 def _open(app: FastAPI, context: AppContext) -> None:
-    files = UploadFiles(context.settings.scratch / "uploads")
+    files = _bytes(context)
     UPLOADS.set(app, Uploads(context, files, JUDGE.of(app), INTAKE.of(app)))
     UNFINISHED_UPLOADS.set(app, files)
+
+
+def _bytes(context: AppContext) -> UploadBytes:
+    """Keep uploads on this machine's disk where no other one serves: SQLite is for one machine."""
+    folder = context.settings.scratch / "uploads"
+    if context.database.engine.dialect.name == "sqlite":
+        return UploadFiles(folder)
+    return UploadParts(context.database, context.storage, folder)
 
 
 @asynccontextmanager

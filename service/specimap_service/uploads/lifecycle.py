@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import hashlib
-import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,7 +12,6 @@ import sqlalchemy as sa
 from fastapi.concurrency import run_in_threadpool
 from sqlalchemy.orm import Session
 
-from specimap_core.atomic import disk_errors, remove
 from specimap_core.errors import NotFoundError
 from specimap_infra.database import rows_changed, utc_now
 from specimap_infra.errors import JobConflictError
@@ -31,7 +29,7 @@ from specimap_service.errors import ForbiddenError, RequestInvalidError, UploadG
 from specimap_service.fair_turns import FairTurns
 from specimap_service.idempotency import Repeatable
 from specimap_service.space import check_disks, check_quota
-from specimap_service.uploads.files import UploadFiles
+from specimap_service.uploads.files import UploadBytes, check_id, locked
 
 FINISH_SECONDS = 60.0
 """How long one process waits for another that finishes the same upload, in addition to the time of the judging."""
@@ -44,7 +42,7 @@ class Uploads:
     """The uploads of the app, their rows and their bytes. All but the coroutines block: call these from a thread."""
 
     context: AppContext
-    files: UploadFiles
+    files: UploadBytes
     judge: Judge
     intake: FairTurns
 
@@ -100,7 +98,7 @@ class Uploads:
             else:
                 _check_wanted(session, acquisition_id, role)
             check_quota(session, principal, size)
-            check_disks(self.context, size, self._expected_bytes(session))
+            check_disks(self.context, size, self.files.coming(session))
             session.add(upload)
             details = {"acquisition": acquisition_id, "role": role, "size": size}
             audit(session, principal.key_id, "upload.create", upload.id, **details)
@@ -141,7 +139,7 @@ class Uploads:
         return await self.intake.run(upload.created_by, self.finish, upload.id)
 
     def _current(self, upload_id: str, principal: Principal) -> tuple[Upload, bool]:
-        self.files.path(upload_id)
+        check_id(upload_id)
         with self.context.database.session() as session:
             upload = load(session, principal, Upload, upload_id)
         if upload.created_by != principal.key_id and not principal.is_admin:
@@ -170,7 +168,7 @@ class Uploads:
                 are kept.
         """
         try:
-            with self.files.locked(upload_id, self.context.settings.judge_seconds + FINISH_SECONDS):
+            with locked(self.files, upload_id, self.context.settings.judge_seconds + FINISH_SECONDS):
                 upload = self._row(upload_id)
                 if upload.state == "open" and self.files.size(upload_id) == upload.size:
                     self._finish(upload)
@@ -180,38 +178,31 @@ class Uploads:
         return self._row(upload_id)
 
     def _finish(self, upload: Upload) -> None:
-        path = self.files.path(upload.id)
-        with open(path, "rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-        # A second name is stored and the first removed only after the commit: a crash in between loses nothing.
-        aside = path.with_suffix(".whole")
-        with disk_errors(aside):
-            aside.unlink(missing_ok=True)
-            os.link(path, aside)
         # The same id at every attempt: the file of an attempt that died is overwritten.
         file_id = f"file_{upload.id.removeprefix('up_')}"
-        try:
-            take_in(
-                self.context,
-                self.judge,
-                Arrival(
-                    file_id,
-                    upload.acquisition_id,
-                    upload.role,
-                    upload.name,
-                    aside,
-                    upload.size,
-                    digest,
-                    upload.created_by,
-                    upload_id=upload.id,
-                ),
-            )
-        except JobConflictError as error:
-            with self.context.database.session() as session:
-                row = session.get_one(Upload, upload.id)
-                row.state, row.error = "failed", error.as_dict()
-        finally:
-            remove(aside)
+        with self.files.whole(upload.id) as path:
+            with open(path, "rb") as file:
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+            try:
+                take_in(
+                    self.context,
+                    self.judge,
+                    Arrival(
+                        file_id,
+                        upload.acquisition_id,
+                        upload.role,
+                        upload.name,
+                        path,
+                        upload.size,
+                        digest,
+                        upload.created_by,
+                        upload_id=upload.id,
+                    ),
+                )
+            except JobConflictError as error:
+                with self.context.database.session() as session:
+                    row = session.get_one(Upload, upload.id)
+                    row.state, row.error = "failed", error.as_dict()
         self.files.remove(upload.id)
 
     def terminate(self, upload_id: str, principal: Principal) -> None:
@@ -250,13 +241,6 @@ class Uploads:
         if upload is None:
             raise no_upload()
         return upload
-
-    def _expected_bytes(self, session: Session) -> int:
-        """Count the bytes that open uploads have still to send."""
-        rows = session.execute(
-            sa.select(Upload.id, Upload.size).where(Upload.state == "open", Upload.expires_at > utc_now())
-        )
-        return sum(max(0, size - (self.files.size(upload_id) or 0)) for upload_id, size in rows)
 
 
 def check_alive(upload: Upload) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import time
 from contextlib import suppress
@@ -10,7 +9,6 @@ from pathlib import Path
 
 import sqlalchemy as sa
 
-from specimap_core.atomic import remove
 from specimap_core.errors import NotFoundError, SpecimapError
 from specimap_infra.database import utc_now
 from specimap_infra.housekeeping import sweep_leftovers
@@ -33,14 +31,12 @@ def sweep(uploads: Uploads) -> None:
                 uploads.finish(row.id)
             continue
         with suppress(NotFoundError):
-            handle = uploads.files.try_lock(row.id)
-            if handle is None:  # another request is writing to it
+            held = uploads.files.try_lock(row.id)
+            if held is None:  # another request is writing to it
                 continue
-            os.close(handle)
+            held.close()
         uploads.expire(row.id)
-    known = {row.id for row in rows}
-    for path in uploads.files.abandoned(known, ABANDONED_SECONDS):
-        remove(path)
+    uploads.files.sweep({row.id for row in rows}, ABANDONED_SECONDS)
     judging = uploads.context.settings.scratch / "judging"
     for folder in judging.iterdir() if judging.is_dir() else ():
         _remove_old(folder)

@@ -20,7 +20,7 @@ from specimap_service.errors import RequestInvalidError
 from specimap_service.idempotency import IdempotencyKey
 from specimap_service.uploads import tus
 from specimap_service.uploads.dependencies import UPLOADS, UploadsDep
-from specimap_service.uploads.files import UploadFiles
+from specimap_service.uploads.files import UploadBytes
 from specimap_service.uploads.lifecycle import Uploads, check_alive
 from specimap_service.uploads.tus_store import UploadStore
 
@@ -47,7 +47,7 @@ async def _check_request(request: Request, principal: Uploader, uploads: Uploads
         given = {"acquisition": upload.acquisition_id, "role": upload.role, "filename": upload.name}
         exchange.headers["Upload-Metadata"] = ",".join(f"{key} {_base64(value)}" for key, value in given.items())
     if request.method == "PATCH":
-        _check_chunk(request, upload, uploads.files, exchange)
+        await run_in_threadpool(_check_chunk, request, upload, uploads.files, exchange)
 
 
 def _base64(value: str) -> str:
@@ -68,7 +68,7 @@ def _check_creation(request: Request) -> None:
         )
 
 
-def _check_chunk(request: Request, upload: Upload, files: UploadFiles, exchange: tus.Exchange) -> None:
+def _check_chunk(request: Request, upload: Upload, files: UploadBytes, exchange: tus.Exchange) -> None:
     headers = request.headers
     if headers.get("content-type") != OCTETS:
         raise HTTPException(415, f"Content-Type must be {OCTETS}")

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import threading
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,23 +16,24 @@ from specimap_core.errors import NotFoundError, SpecimapError
 from specimap_infra.errors import StorageUnavailableError
 from specimap_infra.tables import Upload
 from specimap_service.auth.keys import Principal
-from specimap_service.uploads.files import POLL_SECONDS, UploadFiles, busy
+from specimap_service.uploads.files import POLL_SECONDS, Appender, UploadBytes, busy
 from specimap_service.uploads.lifecycle import check_alive
 from specimap_service.uploads.tus import BATCH, Exchange, exchange, http_date
 
 TAKEOVER_SECONDS = 2.0
 """Silence after which another request for the same upload may take over."""
-LOCK_SECONDS = 4.0
+LOCK_SECONDS = 7.0
+"""How long a request waits for a locked upload: longer than a dead process keeps it."""
 
 
-class _LockedFile:
-    """A locked file that a request appends to. ``error``: why a write failed."""
+class _Locked:
+    """A locked upload that a request appends to. ``error``: why a write failed."""
 
-    def __init__(self, handle: int, holder: Exchange) -> None:
+    def __init__(self, appender: Appender, holder: Exchange) -> None:
         self.holder = holder
         self.pending = bytearray()
         self.error: SpecimapError | None = None
-        self._handle = handle
+        self._appender = appender
         self._lock = threading.Lock()
 
     def write(self, folder: Path, *, sync: bool) -> int:
@@ -44,9 +44,9 @@ class _LockedFile:
                 with disk_errors(folder), memoryview(data) as view:
                     at = 0
                     while at < len(view):
-                        at += os.write(self._handle, view[at:])
+                        at += self._appender.write(view[at:])
                     if sync:
-                        os.fdatasync(self._handle)
+                        self._appender.sync()
             except SpecimapError as error:
                 self.error = error
                 raise
@@ -56,26 +56,31 @@ class _LockedFile:
             return len(data)
 
     def close(self) -> None:
-        """Close the file and release its lock, after a write that a cancelled request may have left unfinished."""
+        """Release the lock, after a write that a cancelled request may have left unfinished; does not wait for that."""
+        if self._lock.acquire(blocking=False):
+            self._appender.close()
+            self._lock.release()
+            return
+        threading.Thread(target=self._close_after_write, daemon=True).start()
+
+    def _close_after_write(self) -> None:
         with self._lock:
-            os.close(self._handle)
-            # A later write then fails instead of reaching another file of the same number.
-            self._handle = -1
+            self._appender.close()
 
 
 class UploadStore(TusStorage):
-    """The library's storage interface on :class:`UploadFiles`. Uploads are described by rows, not by side files."""
+    """The library's storage interface on :class:`UploadBytes`. Uploads are described by rows, not by side files."""
 
     def __init__(
         self,
-        files: UploadFiles,
+        files: UploadBytes,
         *,
         received: Callable[[int], None],
         delete: Callable[[str, Principal], None],
         renewed: Callable[[Upload], Upload],
     ) -> None:
         self._files, self._received, self._delete, self._renewed = files, received, delete, renewed
-        self._locked: dict[str, _LockedFile] = {}
+        self._locked: dict[str, _Locked] = {}
 
     async def create(self, uid: str) -> None:
         """Do nothing: the file was created before the row."""
@@ -83,7 +88,7 @@ class UploadStore(TusStorage):
     async def exists(self, uid: str) -> bool:
         """Return whether the request's upload has a file, or had a complete one."""
         upload = await self._renew()
-        return upload is not None and (upload.state != "open" or self._files.size(uid) is not None)
+        return upload is not None and (upload.state != "open" or await self._size(uid) is not None)
 
     async def _renew(self) -> Upload | None:
         """Return the request's upload as it stands. Raises UploadGoneError where it was ended meanwhile."""
@@ -98,7 +103,10 @@ class UploadStore(TusStorage):
         upload = exchange().upload
         if upload is not None and upload.state != "open":
             return upload.size
-        return self._files.size(uid) or 0
+        return await self._size(uid) or 0
+
+    async def _size(self, uid: str) -> int | None:
+        return await asyncio.to_thread(self._files.size, uid)
 
     async def append(self, uid: str, chunk: bytes) -> None:
         """Take a piece; it is written together with others."""
@@ -112,7 +120,7 @@ class UploadStore(TusStorage):
         if uid in self._locked:
             await asyncio.to_thread(self._write, self._locked[uid], sync=True)
 
-    def _write(self, held: _LockedFile, *, sync: bool) -> None:
+    def _write(self, held: _Locked, *, sync: bool) -> None:
         # Raised again when the lock is released: the library would answer a failure here with success.
         self._received(held.write(self._files.folder, sync=sync))
 
@@ -170,7 +178,7 @@ class UploadStore(TusStorage):
         deadline = clock() + LOCK_SECONDS
         while True:
             try:
-                handle = self._files.try_lock(uid)
+                appender = await asyncio.to_thread(self._files.try_lock, uid)
             except NotFoundError:
                 # Another request has finished it while this one waited: its offset is its length now.
                 upload = await self._renew()
@@ -178,7 +186,7 @@ class UploadStore(TusStorage):
                     raise
                 yield
                 return
-            if handle is not None:
+            if appender is not None:
                 break
             other = self._locked.get(uid)
             if other is not None and other.holder.silent_seconds() > TAKEOVER_SECONDS:
@@ -186,7 +194,8 @@ class UploadStore(TusStorage):
             if clock() > deadline:
                 raise busy()
             await asyncio.sleep(POLL_SECONDS)
-        held = self._locked[uid] = _LockedFile(handle, exchange())
+        held = self._locked[uid] = _Locked(appender, exchange())
+        appender.when_wanted(_giving_way(asyncio.get_running_loop(), held.holder))
         try:
             yield
         finally:
@@ -194,3 +203,17 @@ class UploadStore(TusStorage):
             held.close()
         if held.error is not None:
             raise held.error
+
+
+def _giving_way(loop: asyncio.AbstractEventLoop, holder: Exchange) -> Callable[[], None]:
+    """Make what ends a request that has fallen silent, from any thread."""
+
+    def give_way() -> None:
+        if holder.silent_seconds() > TAKEOVER_SECONDS:
+            holder.abandon()
+
+    def soon() -> None:
+        with suppress(RuntimeError):  # the loop has ended
+            loop.call_soon_threadsafe(give_way)
+
+    return soon
