@@ -64,7 +64,7 @@ class TracedSettings(PhantomSettings):
     light_samples: int = 64
     """Paths from each place of a surface, by which its light is found."""
     light_depth: int = 6
-    """Most segments of a path."""
+    """Most segments of a path from a lamp to the camera."""
 
     # ---- cards ----
     card_gloss: float = 0.0
