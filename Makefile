@@ -4,19 +4,21 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup learned demo test test-fast lint bench bench-service check-images clean
+.PHONY: help setup learned path-traced demo test test-fast lint bench bench-service check-images clean
 
 PYTHON ?= python3
 VENV := .venv
 RUN := $(VENV)/bin
 STAMP := $(VENV)/.specimap-installed
 LEARNED := $(VENV)/.specimap-learned
+PATH_TRACED := $(VENV)/.specimap-path-traced
 DEMO_OUT ?= out/demo
 TEST_PROCESSES ?= 3
 
 help:
 	@echo "make setup   install the pinned versions into $(VENV)"
 	@echo "make learned add PyTorch and the learned features"
+	@echo "make path-traced add Mitsuba, for path-traced phantoms"
 	@echo "make demo    set up, then run samples/ through a service of its own into $(DEMO_OUT)"
 	@echo "make test    set up, with the learned features, then run all tests"
 	@echo "make test-fast   the same without the tests marked slow"
@@ -50,6 +52,13 @@ $(LEARNED): requirements-learned.lock requirements-no-deps.lock $(STAMP)
 	@echo "Installing PyTorch and the learned features into $(VENV)"
 	@$(RUN)/python -m pip install --quiet --disable-pip-version-check --requirement requirements-learned.lock
 	@$(RUN)/python -m pip install --quiet --disable-pip-version-check --no-deps --requirement requirements-no-deps.lock
+	@touch $@
+
+path-traced: $(PATH_TRACED)
+
+$(PATH_TRACED): requirements-path-traced.lock $(STAMP)
+	@echo "Installing Mitsuba into $(VENV)"
+	@$(RUN)/python -m pip install --quiet --disable-pip-version-check --requirement requirements-path-traced.lock
 	@touch $@
 
 demo: setup

@@ -49,6 +49,10 @@ def cases(data: Path | None, work: Path) -> list[Case]:
             Case("phantom A, 80 % of the photos", phantom, 0.8),
             Case("phantom A, 50 % of the photos", phantom, 0.5),
             Case("phantom hard", data / "phantom_hard"),
+            *(
+                Case(f"path-traced {file.parent.name}", file.parent)
+                for file in sorted((data / "path_traced").glob("*/truth.npz"))
+            ),
         ]
     return found
 

@@ -15,6 +15,7 @@ from specimap_cli.backup import backup, restore
 from specimap_cli.doctor import doctor
 from specimap_cli.errors import Debug, reported_errors, stoppable
 from specimap_cli.keys import keys_app
+from specimap_cli.phantom import phantom
 from specimap_cli.progress import Listener, json_listener, progress_listener
 from specimap_cli.projects import projects_app
 from specimap_cli.report import report
@@ -208,6 +209,7 @@ def _root(
 
 app.command()(report)
 app.command()(validate)
+app.command()(phantom)
 app.command()(doctor)
 app.command()(backup)
 app.command()(restore)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from bench.accuracy import cases
 from bench.growth import (
     DISK_SHARE,
     FACTORS,
@@ -271,3 +272,13 @@ def test_a_table_of_the_page_says_what_it_was_measured_on() -> None:
     output = run_tables("growth", {"figures": figures, "machine": machine, "time": "2026-01-02T03:04:05+00:00"})
     assert "| 4 | 4 x 2 | 3.00 | - | - | - | - | - | - |" in output
     assert output.endswith("3 x a processor, 5 GB, Python 3.11, load 0.5 before, 0.75 after; 2026-01-02.")
+
+
+def test_path_traced_phantoms_in_the_test_data_are_judged_in_the_order_of_their_names(tmp_path: Path) -> None:
+    for name in ("noisy_2", "clean_1", "empty"):
+        (tmp_path / "path_traced" / name).mkdir(parents=True)
+    for name in ("noisy_2", "clean_1"):
+        (tmp_path / "path_traced" / name / "truth.npz").touch()
+    found = [case for case in cases(tmp_path, tmp_path / "work") if case.name.startswith("path-traced")]
+    assert [case.name for case in found] == ["path-traced clean_1", "path-traced noisy_2"]
+    assert found[0].folder == tmp_path / "path_traced" / "clean_1"

@@ -10,19 +10,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from specimap_core.geometry.cameras import View
+from specimap_core.arrays import Floats, Singles
+from specimap_core.geometry.cameras import Pose, View
 from specimap_core.photos.colour import srgb_from_linear
 from specimap_core.truth.truth_file import Truth
 from specimap_validation.phantom import materials
 from specimap_validation.phantom.render import CLASS_SPECIMEN, Paint, Rendering, render_view
 from specimap_validation.phantom.scene import Scene, build_scene, without_cards
 from specimap_validation.phantom.settings import PhantomSettings, Stream
-from specimap_validation.phantom.specimen import displacement
+from specimap_validation.phantom.specimen import Specimen, displacement
 from specimap_validation.phantom.views import hsi_view, photo_views
 
 REFLECTANCE_SCALE = 10000
 _CUBE_SHADING = 0.5  # a reflectance cube has most of the light's unevenness calibrated away
 _THREADS = 2
+_JPEG_QUALITY = 95
 
 
 class Phantom:
@@ -37,9 +39,29 @@ class Phantom:
         return build_scene(self.settings)
 
     @cached_property
+    def specimen(self) -> Specimen:
+        """The specimen as it lies in the photos."""
+        return self.scene.specimen
+
+    @cached_property
+    def marker_corners(self) -> Floats:
+        """(N, 4, 3) mm, as the truth holds them."""
+        return self.scene.cards.corners
+
+    @cached_property
     def views(self) -> list[View]:
         """The photos' cameras."""
         return photo_views(self.settings)
+
+    @cached_property
+    def hsi_view(self) -> View:
+        """The cube's camera."""
+        return hsi_view(self.settings)
+
+    @cached_property
+    def motion(self) -> Pose | None:
+        """Make the rigid map from the specimen's place in the photos to that in the cube; None if it stays."""
+        return displacement(self.settings) if self.settings.moved else None
 
     def photos(self) -> Generator[tuple[str, NDArray[np.uint8]]]:
         """Name and upright RGB image (H, W, 3) of each photo, in order."""
@@ -55,6 +77,11 @@ class Phantom:
                 # A caller that stops early does not wait for the remaining photos.
                 pool.shutdown(wait=False, cancel_futures=True)
 
+    def jpeg_quality(self, index: int) -> int:
+        """Quality with which a photo is compressed, 1..100."""
+        del index
+        return _JPEG_QUALITY
+
     def _photo(self, index: int, scene: Scene, paint: Paint) -> NDArray[np.uint8]:
         s = self.settings
         rng = s.rng(Stream.PHOTO, index)
@@ -67,17 +94,23 @@ class Phantom:
         return np.asarray(np.clip(encoded * 255 + 0.5, 0, 255), np.uint8)
 
     @cached_property
-    def _cube_rendering(self) -> Rendering:
-        moved = displacement(self.settings) if self.settings.moved else None
-        scene = self.scene if moved is None else build_scene(self.settings, moved)
-        # One channel per material: the mixture of each pixel, times its shading.
+    def cube_rendering(self) -> Rendering:
+        """What the cube's camera sees, one channel per material: each pixel's mixture, times its shading."""
+        scene = self.scene if self.motion is None else build_scene(self.settings, self.motion)
         paint = Paint.of(scene, np.eye(len(materials.MATERIALS)), _CUBE_SHADING)
-        rendering = render_view(scene, hsi_view(self.settings), paint)
-        if moved is not None:
-            # Truth is the tissue that a pixel saw, at the place where the photos show it.
-            tissue = rendering.classes == CLASS_SPECIMEN
-            rendering.xyz[tissue] = moved.inverse().apply(rendering.xyz[tissue])
+        rendering = render_view(scene, self.hsi_view, paint)
+        self.take_back(rendering.xyz, rendering.classes)
         return rendering
+
+    def take_back(self, xyz: Floats, classes: NDArray[np.uint8]) -> None:
+        """Put the tissue that the cube's pixels saw, ``xyz`` (H, W, 3), where the photos show it: that is its truth."""
+        if self.motion is not None:
+            tissue = classes == CLASS_SPECIMEN
+            xyz[tissue] = self.motion.inverse().apply(xyz[tissue])
+
+    def reflectance(self, spectra: Singles) -> Singles:
+        """What the cube's camera measures of endmembers (M, B) but for noise: (rows, columns, B)."""
+        return np.asarray(self.cube_rendering.image @ spectra, np.float32)
 
     @cached_property
     def _defects(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -99,8 +132,8 @@ class Phantom:
         sd = (s.cube_noise * (1 + 3 * middle**4)).astype(np.float32)
         bad, dead = self._defects
         sd[bad] = 0.3
-        spectra[:, bad] = 0
-        reflectance = self._cube_rendering.image @ spectra
+        reflectance = self.reflectance(spectra)
+        reflectance[..., bad] = 0
         reflectance += sd * rng.standard_normal(reflectance.shape, dtype=np.float32)
         reflectance[dead[:, 0], dead[:, 1]] = 0
         reflectance *= REFLECTANCE_SCALE
@@ -108,18 +141,18 @@ class Phantom:
 
     @cached_property
     def truth(self) -> Truth:
-        """The exact truth about the phantom."""
-        s, scene, rendering = self.settings, self.scene, self._cube_rendering
+        """Exact geometry and spectra."""
+        s, rendering = self.settings, self.cube_rendering
         total = rendering.image.sum(2, keepdims=True)
         abundance = np.divide(rendering.image, total, out=np.zeros_like(rendering.image), where=total > 0)
         bad, dead = self._defects
         return Truth(
             marker_ids=np.array(s.marker_ids, np.int64),
-            marker_corners=scene.cards.corners,
+            marker_corners=self.marker_corners,
             edge_mm=s.edge_mm,
             views=self.views,
             photo_names=[f"rgb/view_{i:03d}.jpg" for i in range(s.photos)],
-            hsi_view=hsi_view(s),
+            hsi_view=self.hsi_view,
             hsi_xyz=rendering.xyz.astype(np.float32),
             hsi_class=rendering.classes,
             abundance=abundance,
@@ -128,6 +161,6 @@ class Phantom:
             materials=materials.MATERIALS,
             bad_bands=bad,
             dead_pixels=dead,
-            vertices=scene.specimen.vertices,
-            triangles=scene.specimen.triangles,
+            vertices=self.specimen.vertices,
+            triangles=self.specimen.triangles,
         )

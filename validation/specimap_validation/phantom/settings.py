@@ -12,6 +12,49 @@ from specimap_core.errors import SettingsError
 
 _ADVICE = "Give a value within the stated range."
 _MOST_TILT_DEG = 20.0
+_LEAST: dict[str, float] = {
+    "seed": 0,
+    "mesh_divisions": 4,
+    "texture_contrast": 0,
+    "gloss": 0,
+    "edge_mm": 0.1,
+    "card_tilt_deg": 0,
+    "card_lift_mm": 0,
+    "photos": 1,
+    "photo_size": 16,
+    "focal_factor": 0.3,
+    "focal_spread": 0,
+    "distance_mm": 60,
+    "blur_px": 0,
+    "exposure_spread": 0,
+    "noise": 0,
+    "cube_rows": 16,
+    "cube_cols": 16,
+    "bands": 1,
+    "hsi_distance_mm": 60,
+    "hsi_tilt_deg": 0,
+    "cube_aspect": 0.1,
+    "scan_skew": -0.5,
+    "scan_pitch_deg": -30,
+    "scan_wobble_mm": 0,
+    "cube_k1": -1,
+    "cube_noise": 0,
+    "bad_band_fraction": 0,
+    "dead_pixel_fraction": 0,
+}
+_MOST: dict[str, float] = {
+    "texture_contrast": 2.5,
+    "card_tilt_deg": 20,
+    "hsi_tilt_deg": 20,
+    "focal_spread": 0.1,
+    "cube_aspect": 10,
+    "scan_skew": 0.5,
+    "scan_pitch_deg": 30,
+    "scan_wobble_mm": 2,
+    "cube_k1": 1,
+    "bad_band_fraction": 0.5,
+    "dead_pixel_fraction": 0.5,
+}
 
 
 class Stream(IntEnum):
@@ -24,6 +67,14 @@ class Stream(IntEnum):
     CUBE = 4
     PHOTO = 5
     TRAY = 6
+
+
+def check_ranges(settings: object, least: dict[str, float], most: dict[str, float]) -> None:
+    """Refuse fields of ``settings`` below ``least`` or above ``most``, or not numbers. Raises ``SettingsError``."""
+    for name, low in least.items():
+        value, high = getattr(settings, name), most.get(name, np.inf)
+        if not low <= value <= high:
+            raise SettingsError(f"{name} is {value}, outside [{low}, {high}].", advice=_ADVICE, setting=name)
 
 
 @dataclass(frozen=True)
@@ -105,53 +156,7 @@ class PhantomSettings:
     """Tilt of the specimen about the x axis through the middle of its base, after the turn; the low side sinks in."""
 
     def __post_init__(self) -> None:
-        least: dict[str, float] = {
-            "seed": 0,
-            "mesh_divisions": 4,
-            "texture_contrast": 0,
-            "gloss": 0,
-            "edge_mm": 0.1,
-            "card_tilt_deg": 0,
-            "card_lift_mm": 0,
-            "photos": 1,
-            "photo_size": 16,
-            "focal_factor": 0.3,
-            "focal_spread": 0,
-            "distance_mm": 60,
-            "blur_px": 0,
-            "exposure_spread": 0,
-            "noise": 0,
-            "cube_rows": 16,
-            "cube_cols": 16,
-            "bands": 1,
-            "hsi_distance_mm": 60,
-            "hsi_tilt_deg": 0,
-            "cube_aspect": 0.1,
-            "scan_skew": -0.5,
-            "scan_pitch_deg": -30,
-            "scan_wobble_mm": 0,
-            "cube_k1": -1,
-            "cube_noise": 0,
-            "bad_band_fraction": 0,
-            "dead_pixel_fraction": 0,
-        }
-        most: dict[str, float] = {
-            "texture_contrast": 2.5,
-            "card_tilt_deg": 20,
-            "hsi_tilt_deg": 20,
-            "focal_spread": 0.1,
-            "cube_aspect": 10,
-            "scan_skew": 0.5,
-            "scan_pitch_deg": 30,
-            "scan_wobble_mm": 2,
-            "cube_k1": 1,
-            "bad_band_fraction": 0.5,
-            "dead_pixel_fraction": 0.5,
-        }
-        for name, low in least.items():
-            value, high = getattr(self, name), most.get(name, np.inf)
-            if not low <= value <= high:
-                raise SettingsError(f"{name} is {value}, outside [{low}, {high}].", advice=_ADVICE, setting=name)
+        check_ranges(self, _LEAST, _MOST)
         if not self.marker_ids or len(set(self.marker_ids)) != len(self.marker_ids):
             raise SettingsError("marker_ids must hold distinct ids.", advice="List each id once.", setting="marker_ids")
         if not set(self.bare_photos) <= set(range(self.photos)):

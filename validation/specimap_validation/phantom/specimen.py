@@ -43,15 +43,15 @@ def build_specimen(settings: PhantomSettings) -> Specimen:
     lumps = NoiseVolume(rng, 9.0, 30.0, slope=1.5)
     wrinkles = NoiseVolume(rng, 1.3, 5.0, slope=1.2)
     regions = NoiseVolume(rng, 7.0, 25.0)
-    first, second = _lobule_distances(rng, base, axes)
+    first, second = lobule_distances(rng, base, axes)
     crease = smoothstep(0.0, 0.9, second - first)
     fat = smoothstep(-0.25, 0.25, regions(base) + 0.15)
 
     displacement = 0.09 * size[2] * lumps(base) + fat * (0.55 * crease - 0.3) + 0.13 * wrinkles(base)
     vertices = base + outward * displacement[:, None]
-    vertices = _rest_on_tray(vertices, settings)
+    vertices = rest_on_tray(vertices, settings)
     normals = vertex_normals(vertices, triangles)
-    return Specimen(vertices, triangles, normals, _tissue(rng, base, axes, fat, crease))
+    return Specimen(vertices, triangles, normals, tissue_of(rng, base, axes, fat, crease))
 
 
 def displacement(settings: PhantomSettings) -> Pose:
@@ -67,7 +67,7 @@ def displaced(specimen: Specimen, motion: Pose) -> Specimen:
     return replace(specimen, vertices=motion.apply(specimen.vertices), normals=specimen.normals @ motion.R.T)
 
 
-def _rest_on_tray(vertices: Floats, settings: PhantomSettings) -> Floats:
+def rest_on_tray(vertices: Floats, settings: PhantomSettings) -> Floats:
     """Cut the underside flat and scale to the exact extents, base just below the tray's surface."""
     low, high = vertices.min(0), vertices.max(0)
     floor = high[2] - (high[2] - low[2]) * 0.775
@@ -80,7 +80,7 @@ def _rest_on_tray(vertices: Floats, settings: PhantomSettings) -> Floats:
     return np.asarray((flat - centre) * extent / (high - low) + [0, 0, TRAY_Z_MM - _SUNK_MM])
 
 
-def _lobule_distances(rng: np.random.Generator, points: Floats, axes: Floats) -> tuple[Floats, Floats]:
+def lobule_distances(rng: np.random.Generator, points: Floats, axes: Floats) -> tuple[Floats, Floats]:
     """Distances (N,), (N,) mm to the nearest and second nearest lobule centre (Worley 1996)."""
     reach = axes + _LOBULE_MM
     count = max(int(8 * reach.prod() / _LOBULE_MM**3), 2)
@@ -89,7 +89,7 @@ def _lobule_distances(rng: np.random.Generator, points: Floats, axes: Floats) ->
     return distances[:, 0], distances[:, 1]
 
 
-def _tissue(rng: np.random.Generator, points: Floats, axes: Floats, fat: Floats, crease: Floats) -> Floats:
+def tissue_of(rng: np.random.Generator, points: Floats, axes: Floats, fat: Floats, crease: Floats) -> Floats:
     """Abundance (V, M): fat lobules between fibrous strands, a tumour on the upper side, vessels."""
     streaks = NoiseVolume(rng, 0.8, 3.0)
     vessels = NoiseVolume(rng, 4.0, 14.0)

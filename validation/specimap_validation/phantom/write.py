@@ -24,30 +24,30 @@ _ENCODERS = {"jpg": cv2.IMWRITE_JPEG_QUALITY, "png": None}
 
 
 def write_phantom(
-    settings: PhantomSettings,
+    of: PhantomSettings | Phantom,
     folder: Path,
     *,
     interleave: str = "bsq",
     photo_format: str = "jpg",
-    quality: int = 95,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Truth:
-    """Write the phantom of ``settings`` into ``folder`` and return its truth.
+    """Write a phantom, or the quick one of some settings, into ``folder`` and return its truth.
 
-    ``interleave``: bsq, bil or bip. ``photo_format``: jpg (of ``quality``) or png. Raises ``SettingsError``; what
-    ``progress`` raises ends the writing.
+    ``interleave``: bsq, bil or bip. ``photo_format``: jpg or png. Raises ``SettingsError``; what ``progress`` raises
+    ends the writing.
     """
     if interleave not in _AXES:
         raise SettingsError(f"interleave is {interleave}.", advice="Use bsq, bil or bip.", setting="interleave")
     if photo_format not in _ENCODERS:
         raise SettingsError(f"photo_format is {photo_format}.", advice="Use jpg or png.", setting="photo_format")
-    phantom = Phantom(settings)
+    phantom = of if isinstance(of, Phantom) else Phantom(of)
+    settings = phantom.settings
     flag = _ENCODERS[photo_format]
     names = []
     with closing(phantom.photos()) as photos:
         for name, image in photos:
             names.append(f"rgb/{name}.{photo_format}")
-            options = [flag, quality] if flag is not None else []
+            options = [flag, phantom.jpeg_quality(len(names) - 1)] if flag is not None else []
             _, encoded = cv2.imencode(f".{photo_format}", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
             with atomic_path(folder / names[-1]) as aside:
                 aside.write_bytes(encoded.tobytes())
