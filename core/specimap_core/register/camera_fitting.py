@@ -19,11 +19,22 @@ from specimap_core.register.camera_models import (
     model_of,
     prior_residuals,
 )
+from specimap_core.register.corner_prior import CornerPrior
 from specimap_core.register.cube_camera import LEAST_SCATTER, CubeCamera, solve_camera
 from specimap_core.register.tile_offsets import TileOffsets
 
-MOTION_SCALES = np.array([0.1, 0.1, 0.01])
-"""Typical change of a shift in mm and a turn in rad."""
+MOTION_SCALES = np.array([0.01] * 3 + [0.1] * 3)
+"""Typical change of a turn in rad and a shift in mm."""
+MOTION_SD = np.array([0.02, 0.02, 0.1, 3.0, 3.0, 0.2])
+"""Standard deviations of a specimen's tilts and turn in rad and of its shift in mm: it is nudged or laid down anew on a
+tray, and what a cube hardly shows, a lift, is not made use of."""
+NO_MOTION = np.zeros(len(MOTION_SCALES))
+
+
+def moved(points: Floats, motion: Floats, middle: Floats) -> Floats:
+    """Points (..., 3) mm turned by the rotation vector ``motion[:3]`` rad about ``middle`` (3,), and shifted by
+    ``motion[3:]`` mm."""
+    return np.asarray((points - middle) @ rotation_from_vector(motion[:3]).T + middle + motion[3:])
 
 
 @dataclass(frozen=True)
@@ -35,6 +46,11 @@ class TileObservations:
     pixels: Floats
     sigma_px: Floats
 
+    @property
+    def middle(self) -> Floats:
+        """The middle (3,) of all tiles, mm, about which a motion turns."""
+        return np.asarray(self.points.mean((0, 1)))
+
     @staticmethod
     def of(measured: TileOffsets, sigma_mm: float) -> TileObservations:
         """Take the tiles that have an offset, each axis with a standard deviation of ``sigma_mm``."""
@@ -44,24 +60,26 @@ class TileObservations:
         return TileObservations(points, pixels, sigma_mm / measured.view.mm_per_px(measured.depth_mm))
 
     def miss(self, view: View, motion: Floats) -> Floats:
-        """By how many standard deviations (T, 2) ``view`` expects it elsewhere, the specimen shifted by ``motion[:2]``
-        mm and turned by ``motion[2]`` rad."""
-        points = self.points
-        if motion.any():
-            middle = points.mean((0, 1))
-            R = rotation_from_vector(np.array([0.0, 0.0, motion[2]]))
-            points = (points - middle) @ R.T + middle + [motion[0], motion[1], 0.0]
+        """By how many standard deviations (T, 2) ``view`` expects it elsewhere, the specimen moved by ``motion`` (6,): a
+        rotation vector about the tiles' middle, rad, and a shift, mm."""
+        points = moved(self.points, motion, self.middle) if motion.any() else self.points
         return np.asarray((view.project(points).mean(1) - self.pixels) / self.sigma_px)
 
 
 @dataclass(frozen=True)
 class CubeObservations:
-    """Observations in the cube: ``corners`` (N, 3) mm at ``pixels`` (N, 2) with ``sigma_px`` (N,), and ``tiles``."""
+    """Observations in the cube: ``corners`` (N, 3) mm at ``pixels`` (N, 2) with ``sigma_px`` (N,), and ``tiles``;
+    ``covariance`` (3 N, 3 N) mm^2 of the corners' own places, None where they are known."""
 
     corners: Floats
     pixels: Floats
     sigma_px: Floats
     tiles: TileObservations | None = None
+    covariance: Floats | None = None
+
+    def prior_through(self, view: View) -> CornerPrior:
+        """The corners as ``view`` sees them, with the errors of their places."""
+        return CornerPrior.of(view, self.corners, self.sigma_px, self.covariance)
 
     def with_inflated_corner_sigma(self, factor: float) -> CubeObservations:
         """The same with the corners' standard deviations ``factor`` times as large."""
@@ -77,9 +95,9 @@ class CubeObservations:
 class CameraFit:
     """A ``camera`` fitted to what was ``observed``.
 
-    ``cost``: robust chi squared of the observations and priors; ``motion`` (3,): shift mm and turn rad of the specimen,
-    zero where it was taken to have stayed; ``scatter``: root mean square of the corners' residuals in standard
-    deviations; ``dof_factor``: root of observations over degrees of freedom, by which fitting makes residuals smaller;
+    ``cost``: robust chi squared of the observations and priors; ``motion`` (6,): turn rad and shift mm of the specimen,
+    zero where it was taken to have stayed; ``corner_shift`` (N, 3) mm: by how much the cube moves the corners from where
+    the photos put them; ``scatter``: root mean square of the corners' residuals in standard deviations; ``dof_factor``: root of observations over degrees of freedom, by which fitting makes residuals smaller;
     ``tile_miss`` (T, 2): residuals of the tiles in their standard deviations.
     """
 
@@ -87,6 +105,7 @@ class CameraFit:
     observed: CubeObservations
     cost: float
     motion: Floats
+    corner_shift: Floats
     scatter: float
     dof_factor: float
     tile_miss: Floats
@@ -126,15 +145,17 @@ def fit(
         RegistrationError: the fit ends with a scan's camera below the markers.
     """
     free = model.free if free is None else free
-    many = free + (3 if motion else 0)
-    weight = 1 / np.maximum(observed.sigma_px, 1e-3)[:, None]
+    many = free + (len(NO_MOTION) if motion else 0)
     corners, tiles = 2 * len(observed.corners), observed.tiles
 
-    def residual(x: Floats, base: View) -> Floats:
-        view = apply_step(base, x[:free])
-        parts = [((view.project(observed.corners) - observed.pixels) * weight).ravel(), np.array(prior_residuals(view))]
+    def residual(x: Floats, base: View, prior: CornerPrior) -> Floats:
+        view = apply_step(base, model.step(x[:free]))
+        miss = view.project(observed.corners) - observed.pixels
+        parts = [prior.whiten(miss), np.array(prior_residuals(view))]
         if tiles is not None:
-            parts.append(tiles.miss(view, x[free:] if motion else np.zeros(3)).ravel())
+            parts.append(tiles.miss(view, x[free:] if motion else NO_MOTION).ravel())
+        if motion:
+            parts.append(x[free:] / MOTION_SD)
         return np.concatenate(parts)
 
     def robust(z: Floats) -> Floats:
@@ -142,7 +163,8 @@ def fit(
         rho = np.empty((3, len(z)))
         root = np.sqrt(1 + z)
         rho[0], rho[1], rho[2] = 2 * (root - 1), 1 / root, -0.5 / root**3
-        far = slice(corners + len(prior_residuals(start)), None)
+        first = corners + len(prior_residuals(start))
+        far = slice(first, first + (0 if tiles is None else 2 * len(tiles.pixels)))
         rho[0, far], rho[1, far], rho[2, far] = np.log1p(z[far]), 1 / (1 + z[far]), -1 / (1 + z[far]) ** 2
         return rho
 
@@ -151,14 +173,17 @@ def fit(
         answer = least_squares(
             residual,
             x,
-            args=(base,),
-            x_scale=np.append(PARAMETER_SCALES[:free], MOTION_SCALES[: many - free]),
+            args=(base, observed.prior_through(base)),
+            x_scale=np.append(PARAMETER_SCALES[list(model.parameters[:free])], MOTION_SCALES[: many - free]),
             loss=robust,
         )
         # Once more from there: steps and covariance are then about the camera that is given.
-        base, x = at_markers(apply_step(base, answer.x[:free])), np.append(np.zeros(free), answer.x[free:])
-    miss = base.project(observed.corners) - observed.pixels
-    scatter = float(((miss * weight) ** 2).sum()) / max(corners - free, 1)
+        base = at_markers(apply_step(base, model.step(answer.x[:free])))
+        x = np.append(np.zeros(free), answer.x[free:])
+    miss, prior = base.project(observed.corners) - observed.pixels, observed.prior_through(base)
+    scatter = float((prior.whiten(miss) ** 2).sum()) / max(corners - free, 1)
+    corner_shift = prior.shift(miss)
+    miss = miss + prior.seen_shift(corner_shift)
     dof_factor = float(np.sqrt(corners / max(corners - free, 1)))
     covariance = (np.linalg.pinv(answer.jac.T @ answer.jac) * max(LEAST_SCATTER, scatter))[:free, :free]
     camera = CubeCamera(
@@ -168,6 +193,8 @@ def fit(
         covariance,
         model,
     )
-    shift = x[free:] if motion else np.zeros(3)
+    shift = x[free:] if motion else NO_MOTION
     tile_miss = tiles.miss(base, shift) if tiles is not None else np.empty((0, 2))
-    return CameraFit(camera, observed, float(2 * answer.cost), shift, float(np.sqrt(scatter)), dof_factor, tile_miss)
+    return CameraFit(
+        camera, observed, float(2 * answer.cost), shift, corner_shift, float(np.sqrt(scatter)), dof_factor, tile_miss
+    )

@@ -8,23 +8,22 @@ where it lies to 0.03 mm; corners and specimen together give the camera, each by
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from specimap_core.arrays import Floats
-from specimap_core.errors import RegistrationError
 from specimap_core.geometry.cameras import View
 from specimap_core.geometry.pushbroom import ScanView
 from specimap_core.notices import Notice
-from specimap_core.register.camera_fitting import CubeObservations
-from specimap_core.register.camera_models import FRAME
+from specimap_core.register.camera_fitting import CameraFit, CubeObservations
+from specimap_core.register.camera_models import Model
 from specimap_core.register.corners import CornersInCube
-from specimap_core.register.cube_camera import Anchor, CubeCamera, solve_camera
+from specimap_core.register.cube_camera import CubeCamera
 from specimap_core.register.cube_markers import CubeMarkers
-from specimap_core.register.model_selection import SelectedCamera, select_camera
-from specimap_core.register.specimen_motion import LEAST_MARKERS, Shift, motion_of_tiles
+from specimap_core.register.model_selection import select_camera
+from specimap_core.register.specimen_motion import Shift, motion_of_tiles
 from specimap_core.register.tile_offsets import TileOffsets, measure_tile_offsets
 from specimap_core.surface.raycast import RayCaster
 from specimap_core.surface.regions import raised_mm
@@ -110,19 +109,17 @@ class RefinedCamera:
 
 
 def refine_camera(
-    seen: CornersInCube, found: CubeMarkers, rows: int, cols: int, caster: RayCaster, corners: Floats
+    seen: CornersInCube,
+    by_corners: Mapping[Model, CameraFit],
+    found: CubeMarkers,
+    caster: RayCaster,
+    corners: Floats,
 ) -> RefinedCamera:
-    """Solve the cube's camera on the corners ``seen``; ``found``: the markers with the image they show in;
-    ``corners`` (Q, 4, 3) mm of all markers.
+    """Solve the cube's camera by the corners ``seen`` and the specimen.
 
-    Raises:
-        RegistrationError: no camera above the plane sees the corners there.
+    ``by_corners``: cameras of every kind by the corners alone; ``found``: the markers with the image they show in;
+    ``corners`` (Q, 4, 3) mm of all markers.
     """
-    flat = seen.flat()
-    try:
-        square = solve_camera(*flat, rows, cols)
-    except RegistrationError:
-        square = None
     vertices = caster.mesh.vertices
     raised = vertices[vertices[:, 2] > raised_mm(corners)].astype(float)
     sample = raised[:: max(1, len(raised) // SAMPLE)]
@@ -130,67 +127,14 @@ def refine_camera(
     def measure(view: View) -> TileOffsets | None:
         return measure_tile_offsets(found.image, view, caster, corners, mirrored=found.mirrored)
 
-    choice = select_camera(CubeObservations(*flat), rows, cols, square, sample, measure)
-    if choice.model is FRAME and square is not None and not choice.misfit_mm:
-        return _refine_square(square, choice, seen, rows, cols, sample, measure)
+    observed = CubeObservations(*seen.flat(), covariance=seen.covariance)
+    choice = select_camera(observed, by_corners, sample, measure)
     camera, alone = choice.fit.camera, choice.by_corners.camera
     if not len(sample):
-        return RefinedCamera(camera, alone.lateral_sd_mm(flat[0]), False, None, misfit_mm=choice.misfit_mm)
+        return RefinedCamera(camera, alone.lateral_sd_mm(seen.flat()[0]), False, None, misfit_mm=choice.misfit_mm)
     marker_sd_mm = alone.lateral_sd_mm(sample)
     joint_sd_mm = float(np.hypot(camera.lateral_sd_mm(sample), JOINT_SD_MM)) if choice.specimen_used else None
     shift = motion_of_tiles(last) if choice.moved and (last := measure(camera.view)) is not None else None
     return RefinedCamera(
         camera, marker_sd_mm, choice.specimen_used, shift, joint_sd_mm, choice.ambiguity_mm, choice.misfit_mm
     )
-
-
-def _refine_square(
-    camera: CubeCamera,
-    choice: SelectedCamera,
-    seen: CornersInCube,
-    rows: int,
-    cols: int,
-    sample: Floats,
-    measure: Callable[[View], TileOffsets | None],
-) -> RefinedCamera:
-    """A frame camera of square pixels: by its markers, or with the specimen's middle where they leave it open."""
-    flat, markers = seen.flat(), len(seen.marker_ids)
-    if not len(sample):
-        return RefinedCamera(camera, camera.lateral_sd_mm(flat[0]), False, None)
-    centre, marker_sd_mm, specimen_used = sample.mean(0), camera.lateral_sd_mm(sample), False
-
-    def motion_through(camera: CubeCamera) -> Shift | None:
-        # However few the markers: it is the camera that is in question here.
-        known = choice.tile_offsets
-        there = known if known is not None and known.view is camera.view else measure(camera.view)
-        return None if there is None else motion_of_tiles(there)
-
-    shift = motion_through(camera)
-    for _ in range(ROUNDS):
-        if shift is None or shift.moved_mm > EXPLAINED_BY_CAMERA * np.hypot(marker_sd_mm, shift.sigma_mm):
-            break
-        across = np.array([*shift.shift_mm, 0.0])
-        pixel = camera.view.project((centre + across)[None])[0]
-        before, camera = (
-            camera,
-            solve_camera(*flat, rows, cols, anchor=Anchor(centre, pixel, shift.sigma_mm / camera.pixel_mm)),
-        )
-        specimen_used = True
-        shift = motion_through(camera)
-        if _apart_mm(before, camera, centre) < CONVERGED_MM:
-            break
-    if not specimen_used and markers < LEAST_MARKERS:
-        shift = None
-    misfit_mm = 0.0
-    if shift is not None and shift.significant and choice.specimen_used and not choice.moved:
-        # Tiles lie elsewhere, but not as those of something that moved as a whole.
-        misfit_mm, shift = shift.moved_mm, None
-    return RefinedCamera(
-        camera, marker_sd_mm, specimen_used, shift, model_sd_mm=choice.ambiguity_mm, misfit_mm=misfit_mm
-    )
-
-
-def _apart_mm(before: CubeCamera, after: CubeCamera, point: Floats) -> float:
-    """How far apart two cameras see a ``point`` (3,)."""
-    miss = before.view.project(point[None]) - after.view.project(point[None])
-    return float(np.linalg.norm(miss)) * after.pixel_mm

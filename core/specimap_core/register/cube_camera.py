@@ -53,9 +53,8 @@ class CubeCamera:
         step = 1e-4
         J = np.stack(
             [
-                (apply_step(self.view, step * e).project(points) - apply_step(self.view, -step * e).project(points))
-                / (2 * step)
-                for e in np.eye(len(self.covariance))
+                (apply_step(self.view, e).project(points) - apply_step(self.view, -e).project(points)) / (2 * step)
+                for e in map(self.model.step, step * np.eye(len(self.covariance)))
             ],
             -1,
         )

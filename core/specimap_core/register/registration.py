@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from specimap_core.register.camera_refinement import RefinedCamera, refine_camer
 from specimap_core.register.corners import corners_in_cube
 from specimap_core.register.cube_markers import CubeMarkers, find_markers, unmirrored
 from specimap_core.register.figures import MethodFigures
+from specimap_core.register.joint_layout import JointLayout, join_cube
 from specimap_core.register.placement import (
     Homography,
     Method,
@@ -42,14 +43,22 @@ class Surface:
     coarse: Grid
     fine: Grid
 
+    def scaled(self, joint: JointLayout) -> Surface:
+        """The same at the scale and with the corners of photos and cube together. The grids, which the published method
+        alone uses, stay those of the photos."""
+        mesh = self.caster.mesh
+        vertices = (mesh.vertices * joint.scale).astype(np.float32)
+        return replace(self, adjusted=joint.adjusted, caster=RayCaster(replace(mesh, vertices=vertices)))
+
 
 @dataclass(frozen=True)
 class Registered:
-    """A registered cube: its ``points`` by ``method``, the ``markers`` found in it, its ``camera``, the ``homography``,
+    """A registered cube: its ``points`` by ``method`` on the ``surface``, which that method may have scaled, the ``markers`` found in it, its ``camera``, the ``homography``,
     the ``figures`` of both methods, and ``parallax_mm`` (S,), how far apart the methods put each point, NaN where one
     of them does not."""
 
     method: Method
+    surface: Surface
     markers: CubeMarkers
     camera: RefinedCamera
     homography: Homography
@@ -72,14 +81,19 @@ def register_cube(
         MarkersMissingInCubeError, DuplicateMarkersError: the cube's markers do not suffice.
         RegistrationError: no camera, or no homography, fits them.
     """
-    adjusted, caster, grids = surface.adjusted, surface.caster, (surface.coarse, surface.fine)
-    markers = find_markers(cube, dictionary, adjusted.marker_ids)
+    grids = surface.coarse, surface.fine
+    markers = find_markers(cube, dictionary, surface.adjusted.marker_ids)
     progress(0.25)
-    seen = corners_in_cube(markers, adjusted, cube.cols)
-    refined = refine_camera(seen, markers, cube.rows, cube.cols, caster, adjusted.corners)
-    camera, (corners, corners_px, _) = refined.camera, seen.flat()
-    homography = fit_homography(corners, corners_px, surface.coarse, settings.ransac_px)
+    by_photos = corners_in_cube(markers, surface.adjusted, cube.cols)
+    homography = fit_homography(*by_photos.flat()[:2], surface.coarse, settings.ransac_px)
+    joint = join_cube(by_photos, surface.adjusted, cube.rows, cube.cols)
     by_camera = settings.method == "camera"
+    if by_camera:
+        surface = surface.scaled(joint)
+    adjusted, caster = surface.adjusted, surface.caster
+    refined = refine_camera(by_photos, joint.by_corners, markers, caster, adjusted.corners)
+    camera = refined.camera
+    seen = corners_in_cube(markers, adjusted, cube.cols)
     placement = (
         place_by_camera(camera.view, caster, markers.mirrored)
         if by_camera
@@ -106,6 +120,6 @@ def register_cube(
     progress(0.875)
     figures = {
         "camera": camera_figures(seen, camera.view, caster),
-        "homography": homography_figures(seen, *grids, settings.ransac_px),
+        "homography": homography_figures(by_photos, *grids, settings.ransac_px),
     }
-    return Registered(settings.method, markers, refined, homography, figures, points, parallax_mm)
+    return Registered(settings.method, surface, markers, refined, homography, figures, points, parallax_mm)
