@@ -45,7 +45,7 @@ class MarkerScene:
     """A state of the unknowns: one lens, P photo poses, and the corners (Q, 4, 3) of Q markers.
 
     ``squares``: poses ``world_from_marker`` of the markers where they are rigid, else None. ``growth_px`` (1 + P,): by
-    how much black has grown at the markers' edges, in all photos and beyond that in each; None where that is no unknown.
+    how much black has grown at the markers' edges, in all photos and beyond that in each; None where it is no unknown.
     """
 
     lens: Intrinsics

@@ -60,8 +60,8 @@ class TileObservations:
         return TileObservations(points, pixels, sigma_mm / measured.view.mm_per_px(measured.depth_mm))
 
     def miss(self, view: View, motion: Floats) -> Floats:
-        """By how many standard deviations (T, 2) ``view`` expects it elsewhere, the specimen moved by ``motion`` (6,): a
-        rotation vector about the tiles' middle, rad, and a shift, mm."""
+        """By how many standard deviations (T, 2) ``view`` expects it elsewhere, the specimen moved by ``motion`` (6,):
+        a rotation vector about the tiles' middle, rad, and a shift, mm."""
         points = moved(self.points, motion, self.middle) if motion.any() else self.points
         return np.asarray((view.project(points).mean(1) - self.pixels) / self.sigma_px)
 
@@ -96,9 +96,11 @@ class CameraFit:
     """A ``camera`` fitted to what was ``observed``.
 
     ``cost``: robust chi squared of the observations and priors; ``motion`` (6,): turn rad and shift mm of the specimen,
-    zero where it was taken to have stayed; ``corner_shift`` (N, 3) mm: by how much the cube moves the corners from where
-    the photos put them; ``scatter``: root mean square of the corners' residuals in standard deviations; ``dof_factor``: root of observations over degrees of freedom, by which fitting makes residuals smaller;
-    ``tile_miss`` (T, 2): residuals of the tiles in their standard deviations.
+    zero where it was taken to have stayed; ``corner_shift`` (N, 3) mm: by how much the cube moves the corners from
+    where the photos put them; ``scatter``: root mean square of the corners' residuals in standard deviations;
+    ``dof_factor``: root of observations over degrees of freedom, by which fitting makes residuals smaller;
+    ``tile_miss`` (T, 2): residuals of the tiles in their standard deviations; ``covariance`` (n, n) of the camera's
+    parameters and, where it may have moved, the specimen's motion.
     """
 
     camera: CubeCamera
@@ -109,6 +111,23 @@ class CameraFit:
     scatter: float
     dof_factor: float
     tile_miss: Floats
+    covariance: Floats
+
+    def specimen_sd_mm(self, places: Floats) -> float:
+        """Lateral standard deviation at ``places`` (N, 3) mm of the specimen, root mean square, by the uncertainty of
+        the camera and of a motion together."""
+        free, view, tiles = self.camera.model.free, self.camera.view, self.observed.tiles
+        if tiles is None or len(self.covariance) == free:
+            return self.camera.lateral_sd_mm(places)
+        step, middle, columns = 1e-4, tiles.middle, []
+        for e in step * np.eye(len(self.covariance)):
+            ahead, back = (
+                apply_step(view, self.camera.model.step(s * e[:free])).project(moved(places, s * e[free:], middle))
+                for s in (1, -1)
+            )
+            columns.append((ahead - back) / (2 * step))
+        J = np.stack(columns, -1) * self.camera.span_mm[:, None]
+        return float(np.sqrt(np.maximum(np.einsum("nij,jk,nik->n", J, self.covariance, J), 0).mean()))
 
     @property
     def tile_mm(self) -> float:
@@ -185,7 +204,8 @@ def fit(
     corner_shift = prior.shift(miss)
     miss = miss + prior.seen_shift(corner_shift)
     dof_factor = float(np.sqrt(corners / max(corners - free, 1)))
-    covariance = (np.linalg.pinv(answer.jac.T @ answer.jac) * max(LEAST_SCATTER, scatter))[:free, :free]
+    whole = np.linalg.pinv(answer.jac.T @ answer.jac) * max(LEAST_SCATTER, scatter)
+    covariance = whole[:free, :free]
     camera = CubeCamera(
         base,
         float(np.sqrt((miss**2).sum(-1).mean())),
@@ -196,5 +216,13 @@ def fit(
     shift = x[free:] if motion else NO_MOTION
     tile_miss = tiles.miss(base, shift) if tiles is not None else np.empty((0, 2))
     return CameraFit(
-        camera, observed, float(2 * answer.cost), shift, corner_shift, float(np.sqrt(scatter)), dof_factor, tile_miss
+        camera,
+        observed,
+        float(2 * answer.cost),
+        shift,
+        corner_shift,
+        float(np.sqrt(scatter)),
+        dof_factor,
+        tile_miss,
+        whole,
     )

@@ -1,7 +1,7 @@
 """Camera models of a cube, as parameters about a given view, and where a solution of each starts.
 
-Eleven parameters describe all of them: a turn, a shift, the logarithms of the focal length and of the pixel's aspect, of
-a scan its skew and climb, and of a frame camera the radial distortion of its lens.
+Eleven parameters describe all of them: a turn, a shift, the logarithms of the focal length and of the pixel's aspect,
+of a scan its skew and climb, and of a frame camera the radial distortion of its lens.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ ASPECT_RANGE = (0.25, 4.0)
 MODEL_PENALTY = 8.0
 """Chi squared that another model must gain over a frame camera of square pixels."""
 RADIAL_SD = 0.004
-"""Of the shift that the lens of a frame camera causes at the image's corner, as a share of the corner's distance from the
-middle: lenses of hyperspectral cameras distort by up to one per cent there."""
+"""Of the shift that the lens of a frame camera causes at the image's corner, as a share of the corner's distance from
+the middle: lenses of hyperspectral cameras distort by up to one per cent there."""
 PARAMETERS = 11
 PARAMETER_SCALES = np.array([1e-3] * 3 + [1.0] * 3 + [0.1, 0.01, 0.01, 0.01, 0.001])
 """Typical change of each parameter."""
@@ -44,8 +44,8 @@ PARAMETER_SCALES = np.array([1e-3] * 3 + [1.0] * 3 + [0.1, 0.01, 0.01, 0.01, 0.0
 
 @dataclass(frozen=True)
 class Model:
-    """A ``kind`` of camera; ``parameters``: which of the eleven it has; ``penalty``: chi squared that it must gain over a
-    frame camera of square pixels."""
+    """A ``kind`` of camera; ``parameters``: which of the eleven it has; ``penalty``: chi squared that it must gain over
+    a frame camera of square pixels."""
 
     kind: Kind
     parameters: tuple[int, ...]

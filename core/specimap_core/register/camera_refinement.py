@@ -9,12 +9,11 @@ where it lies to 0.03 mm; corners and specimen together give the camera, each by
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from specimap_core.arrays import Floats
-from specimap_core.geometry.cameras import View
 from specimap_core.geometry.pushbroom import ScanView
 from specimap_core.notices import Notice
 from specimap_core.register.camera_fitting import CameraFit, CubeObservations
@@ -22,9 +21,10 @@ from specimap_core.register.camera_models import Model
 from specimap_core.register.corners import CornersInCube
 from specimap_core.register.cube_camera import CubeCamera
 from specimap_core.register.cube_markers import CubeMarkers
-from specimap_core.register.model_selection import select_camera
+from specimap_core.register.model_selection import MeasureOffsets, select_camera
+from specimap_core.register.motion_repair import FollowedMotion, follow_motion
 from specimap_core.register.specimen_motion import Shift, motion_of_tiles
-from specimap_core.register.tile_offsets import TileOffsets, measure_tile_offsets
+from specimap_core.register.tile_offsets import measure_tile_offsets
 from specimap_core.surface.raycast import RayCaster
 from specimap_core.surface.regions import raised_mm
 
@@ -61,6 +61,7 @@ class RefinedCamera:
     joint_sd_mm: float | None = None
     model_sd_mm: float = 0.0
     misfit_mm: float = 0.0
+    followed: FollowedMotion | None = None
 
     @property
     def moved(self) -> bool:
@@ -71,7 +72,7 @@ class RefinedCamera:
     @property
     def lateral_sd_mm(self) -> float:
         """Lateral standard deviation of a registered pixel of the specimen."""
-        if self.shift is not None and self.moved:
+        if self.shift is not None and self.moved and self.followed is None:
             # Spectra are off their places by this much, and the camera may add its own error.
             return float(np.hypot(self.shift.moved_mm, self.camera_sd_mm))
         return self.camera_sd_mm
@@ -98,7 +99,13 @@ class RefinedCamera:
             text = f"The cube's pixels are {aspect:.3f} times as high as they are wide; this was accounted for."
             warnings.append(Notice("cube_pixels_not_square", text))
         if self.shift is not None and self.moved:
-            warnings.append(Notice("specimen_moved", self.shift.message))
+            text = self.shift.message
+            if self.followed is not None:
+                text += (
+                    f" The motion, {self.followed.moved_mm:.1f} mm with a turn of {self.followed.turn_deg:.1f} degrees,"
+                    " was followed as that of a rigid body; a bend was not."
+                )
+            warnings.append(Notice("specimen_moved", text))
         if self.misfit_mm:
             text = f"No camera sees markers and specimen as the cube shows them: about {self.misfit_mm:.2f} mm remain."
             warnings.append(Notice("cube_camera_unfit", text))
@@ -124,9 +131,10 @@ def refine_camera(
     raised = vertices[vertices[:, 2] > raised_mm(corners)].astype(float)
     sample = raised[:: max(1, len(raised) // SAMPLE)]
 
-    def measure(view: View) -> TileOffsets | None:
-        return measure_tile_offsets(found.image, view, caster, corners, mirrored=found.mirrored)
+    def measure_through(there: RayCaster) -> MeasureOffsets:
+        return lambda view: measure_tile_offsets(found.image, view, there, corners, mirrored=found.mirrored)
 
+    measure = measure_through(caster)
     observed = CubeObservations(*seen.flat(), covariance=seen.covariance)
     choice = select_camera(observed, by_corners, sample, measure)
     camera, alone = choice.fit.camera, choice.by_corners.camera
@@ -135,6 +143,11 @@ def refine_camera(
     marker_sd_mm = alone.lateral_sd_mm(sample)
     joint_sd_mm = float(np.hypot(camera.lateral_sd_mm(sample), JOINT_SD_MM)) if choice.specimen_used else None
     shift = motion_of_tiles(last) if choice.moved and (last := measure(camera.view)) is not None else None
-    return RefinedCamera(
+    found_camera = RefinedCamera(
         camera, marker_sd_mm, choice.specimen_used, shift, joint_sd_mm, choice.ambiguity_mm, choice.misfit_mm
     )
+    if not found_camera.moved:
+        return found_camera
+    followed = follow_motion(choice.fit, observed, measure_through, caster, corners, sample)
+    joint_sd_mm = float(np.hypot(followed.fit.specimen_sd_mm(sample), JOINT_SD_MM))
+    return replace(found_camera, camera=followed.fit.camera, joint_sd_mm=joint_sd_mm, followed=followed)

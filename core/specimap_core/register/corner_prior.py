@@ -24,8 +24,8 @@ STEP_MM = 1e-2
 class CornerPrior:
     """N corners seen through a camera.
 
-    ``derivatives`` (N, 2, 3): of a pixel by its corner's place, px/mm; ``covariance`` (3 N, 3 N) mm^2 of the places, None
-    where they are known; ``root`` (2 N, 2 N): lower Cholesky factor of the residuals' covariance, px.
+    ``derivatives`` (N, 2, 3): of a pixel by its corner's place, px/mm; ``covariance`` (3 N, 3 N) mm^2 of the places,
+    None where they are known; ``root`` (2 N, 2 N): lower Cholesky factor of the residuals' covariance, px.
     """
 
     derivatives: Floats
@@ -43,15 +43,15 @@ class CornerPrior:
             [(view.project(corners + step) - view.project(corners - step)) / (2 * STEP_MM) for step in steps], -1
         )
         shared = _seen(derivatives, _seen(derivatives, covariance).T)
-        return CornerPrior(derivatives, covariance, np.linalg.cholesky(shared + np.diag(noise**2)))
+        return CornerPrior(derivatives, covariance, np.asarray(np.linalg.cholesky(shared + np.diag(noise**2)), float))
 
     def whiten(self, miss: Floats) -> Floats:
         """Residuals (N, 2) px as 2 N independent ones in standard deviations."""
         return np.asarray(solve_triangular(self.root, miss.ravel(), lower=True))
 
     def shift(self, miss: Floats, of: Floats | None = None) -> Floats:
-        """By how much (N, 3) mm the corners' places move, given residuals ``miss`` (N, 2) of the camera; of other places
-        (K, 3) with ``of``, their covariance (3 K, 3 N) with the corners."""
+        """By how much (N, 3) mm the corners' places move, given residuals ``miss`` (N, 2) of the camera; of other
+        places (K, 3) with ``of``, their covariance (3 K, 3 N) with the corners."""
         if self.covariance is None:
             return np.zeros((len(miss), 3))
         weighed = solve_triangular(self.root, self.whiten(miss), lower=True, trans="T")
@@ -61,8 +61,8 @@ class CornerPrior:
     def reduced(self, covariance: Floats, of: Floats, by_camera: Floats, camera_weight: Floats) -> Floats:
         """What is left of the ``covariance`` (3 K, 3 K) of places once the cube has shown its corners.
 
-        ``of`` (3 K, 3 N): with the corners; ``by_camera`` (2 N, P): derivatives of the pixels by the camera's P unknowns,
-        which the corners have to tell as well, and ``camera_weight`` (P, P): what is known of these before.
+        ``of`` (3 K, 3 N): with the corners; ``by_camera`` (2 N, P): derivatives of the pixels by the camera's P
+        unknowns, which the corners have to tell as well, and ``camera_weight`` (P, P): what is known of these before.
         """
         seen = solve_triangular(self.root, _seen(self.derivatives, of.T), lower=True)
         camera = solve_triangular(self.root, by_camera, lower=True)

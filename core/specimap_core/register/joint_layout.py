@@ -1,8 +1,8 @@
 """The markers' layout by photos and cube together.
 
 A cube shows its markers far more sharply than the layout that the photos give them, which errs in scale by a thousandth
-where exposure or blur moves all edges of the photos alike. So the cube joins the adjustment as one more camera: corners,
-their covariance and the scale of everything the photos placed are those that both together give.
+where exposure or blur moves all edges of the photos alike. So the cube joins the adjustment as one more camera:
+corners, their covariance and the scale of everything that the photos placed are those that both together give.
 """
 
 from __future__ import annotations
@@ -73,8 +73,8 @@ def join_cube(seen: CornersInCube, adjusted: Adjusted, rows: int, cols: int) -> 
 
 
 def _camera_derivatives(view: View, model: Model, corners: Floats) -> tuple[Floats, Floats]:
-    """Derivatives (2 N, P) of the pixels of ``corners`` (N, 3) by the camera's parameters, and what priors say of these,
-    (P, P)."""
+    """Derivatives (2 N, P) of the pixels of ``corners`` (N, 3) by the camera's parameters, and the weight (P, P) of the
+    priors of these."""
     pixels, priors = [], []
     for step in map(model.step, STEP * np.eye(model.free)):
         ahead, back = apply_step(view, step), apply_step(view, -step)

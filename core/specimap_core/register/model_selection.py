@@ -196,6 +196,22 @@ def _fit_all(
     return fits
 
 
+def fit_tiles(camera: CubeCamera, observed: CubeObservations, seen: TileOffsets, *, moved: bool) -> CameraFit | None:
+    """Fit a camera, of the model that it has, to corners and tiles as a camera is measured; None where none fits."""
+    sigma_mm, view = TILE_MM, camera.view
+    tiles = TileObservations.of(seen, sigma_mm)
+    if len(tiles.pixels) < LEAST_TILES:
+        return None
+    try:
+        for _ in range(2):
+            whole = replace(observed, tiles=TileObservations.of(seen, sigma_mm))
+            fitted = fit(view, camera.model, whole, motion=moved)
+            sigma_mm = max(LEAST_TILE_MM, SIGMA_OF_MAD * float(np.median(np.abs(fitted.tile_miss))) * sigma_mm)
+        return fit(view, camera.model, whole.with_inflated_tile_sigma(SHARED_TILE_ERROR), motion=moved)
+    except RegistrationError:
+        return None
+
+
 def _penalised(choice: tuple[Model, bool], fitted: CameraFit) -> float:
     return fitted.cost + choice[0].penalty + MOTION_PENALTY * choice[1]
 

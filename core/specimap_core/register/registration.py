@@ -18,6 +18,7 @@ from specimap_core.register.corners import corners_in_cube
 from specimap_core.register.cube_markers import CubeMarkers, find_markers, unmirrored
 from specimap_core.register.figures import MethodFigures
 from specimap_core.register.joint_layout import JointLayout, join_cube
+from specimap_core.register.motion_repair import at_rest, moved_mesh, seen_at_rest
 from specimap_core.register.placement import (
     Homography,
     Method,
@@ -53,9 +54,9 @@ class Surface:
 
 @dataclass(frozen=True)
 class Registered:
-    """A registered cube: its ``points`` by ``method`` on the ``surface``, which that method may have scaled, the ``markers`` found in it, its ``camera``, the ``homography``,
-    the ``figures`` of both methods, and ``parallax_mm`` (S,), how far apart the methods put each point, NaN where one
-    of them does not."""
+    """A registered cube: its ``points`` by ``method`` on the ``surface``, which that method may have scaled, the
+    ``markers`` found in it, its ``camera``, the ``homography``, the ``figures`` of both methods, and ``parallax_mm``
+    (S,), how far apart the methods put each point, NaN where one of them does not."""
 
     method: Method
     surface: Surface
@@ -94,16 +95,17 @@ def register_cube(
     refined = refine_camera(by_photos, joint.by_corners, markers, caster, adjusted.corners)
     camera = refined.camera
     seen = corners_in_cube(markers, adjusted, cube.cols)
+    there = caster
+    if refined.followed is not None:
+        there = RayCaster(moved_mesh(caster.mesh, refined.followed.motion, adjusted.corners))
     placement = (
-        place_by_camera(camera.view, caster, markers.mirrored)
+        at_rest(place_by_camera(camera.view, there, markers.mirrored), caster)
         if by_camera
         else place_by_homography(homography, *grids, camera.view, caster, markers.mirrored)
     )
     pixels = unmirrored(placement.pixels[:, ::-1].astype(float), markers.mirrored, cube.cols)
     by_other_method = (
-        homography_xyz(homography, *grids, pixels)
-        if by_camera
-        else caster.cast(camera.view.origins(pixels), camera.view.world_rays(pixels)).xyz
+        homography_xyz(homography, *grids, pixels) if by_camera else seen_at_rest(camera.view, pixels, there, caster)
     )
     parallax_mm = np.linalg.norm(placement.xyz - by_other_method, axis=1).astype(np.float32)
     progress(0.75)
