@@ -25,36 +25,37 @@ class CornerPrior:
     """N corners seen through a camera.
 
     ``derivatives`` (N, 2, 3): of a pixel by its corner's place, px/mm; ``covariance`` (3 N, 3 N) mm^2 of the places,
-    None where they are known; ``root`` (2 N, 2 N): lower Cholesky factor of the residuals' covariance, px.
+    None where they are known; ``weight`` (2 N, 2 N) 1/px: inverse Cholesky factor of the residuals' covariance.
     """
 
     derivatives: Floats
     covariance: Floats | None
-    root: Floats
+    weight: Floats
 
     @staticmethod
     def of(view: View, corners: Floats, sigma_px: Floats, covariance: Floats | None) -> CornerPrior:
         """Corners (N, 3) mm measured with ``sigma_px`` (N,) through ``view``."""
         noise = np.repeat(np.maximum(sigma_px, LEAST_SIGMA_PX), 2)
         if covariance is None:
-            return CornerPrior(np.zeros((len(corners), 2, 3)), None, np.diag(noise))
+            return CornerPrior(np.zeros((len(corners), 2, 3)), None, np.diag(1 / noise))
         steps = STEP_MM * np.eye(3)
         derivatives = np.stack(
             [(view.project(corners + step) - view.project(corners - step)) / (2 * STEP_MM) for step in steps], -1
         )
         shared = _seen(derivatives, _seen(derivatives, covariance).T)
-        return CornerPrior(derivatives, covariance, np.asarray(np.linalg.cholesky(shared + np.diag(noise**2)), float))
+        root = np.linalg.cholesky(shared + np.diag(noise**2))
+        return CornerPrior(derivatives, covariance, solve_triangular(root, np.eye(len(root)), lower=True))
 
     def whiten(self, miss: Floats) -> Floats:
         """Residuals (N, 2) px as 2 N independent ones in standard deviations."""
-        return np.asarray(solve_triangular(self.root, miss.ravel(), lower=True))
+        return np.asarray(self.weight @ miss.ravel())
 
     def shift(self, miss: Floats, of: Floats | None = None) -> Floats:
         """By how much (N, 3) mm the corners' places move, given residuals ``miss`` (N, 2) of the camera; of other
         places (K, 3) with ``of``, their covariance (3 K, 3 N) with the corners."""
         if self.covariance is None:
             return np.zeros((len(miss), 3))
-        weighed = solve_triangular(self.root, self.whiten(miss), lower=True, trans="T")
+        weighed = self.weight.T @ self.whiten(miss)
         of = self.covariance if of is None else of
         return np.asarray(-(_seen(self.derivatives, of.T).T @ weighed).reshape(-1, 3))
 
@@ -64,8 +65,8 @@ class CornerPrior:
         ``of`` (3 K, 3 N): with the corners; ``by_camera`` (2 N, P): derivatives of the pixels by the camera's P
         unknowns, which the corners have to tell as well, and ``camera_weight`` (P, P): what is known of these before.
         """
-        seen = solve_triangular(self.root, _seen(self.derivatives, of.T), lower=True)
-        camera = solve_triangular(self.root, by_camera, lower=True)
+        seen = self.weight @ _seen(self.derivatives, of.T)
+        camera = self.weight @ by_camera
         taken = camera.T @ seen
         gained = seen.T @ seen - taken.T @ np.linalg.solve(camera.T @ camera + camera_weight, taken)
         return np.asarray(covariance - (gained + gained.T) / 2)

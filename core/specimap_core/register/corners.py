@@ -27,6 +27,14 @@ class CornersInCube:
     sigma_px: Floats
     covariance: Floats | None = None
 
+    def of(self, keep: NDArray[np.bool_]) -> CornersInCube:
+        """Those of the markers in ``keep`` (Q,)."""
+        ids = tuple(i for i, kept in zip(self.marker_ids, keep, strict=True) if kept)
+        covariance = (
+            None if self.covariance is None else self.covariance[np.ix_(np.repeat(keep, 12), np.repeat(keep, 12))]
+        )
+        return CornersInCube(ids, self.corners[keep], self.corners_px[keep], self.sigma_px[keep], covariance)
+
     def flat(self, keep: NDArray[np.bool_] | None = None) -> tuple[Floats, Floats, Floats]:
         """Corners (N, 3), pixels (N, 2), sigma (N,) of the markers in ``keep``, of all by default."""
         chosen = slice(None) if keep is None else keep

@@ -8,6 +8,7 @@ corners, their covariance and the scale of everything that the photos placed are
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,28 +17,47 @@ from specimap_core.arrays import Floats
 from specimap_core.bundle_adjust.adjust import Adjusted
 from specimap_core.errors import RegistrationError
 from specimap_core.geometry.cameras import Pose, View, fit_similarity
+from specimap_core.notices import Notice
 from specimap_core.register.camera_fitting import CameraFit, CubeObservations, fit
 from specimap_core.register.camera_models import Model, apply_step, prior_residuals
 from specimap_core.register.corners import CornersInCube
-from specimap_core.register.cube_camera import CubeCamera, solve_camera
+from specimap_core.register.cube_camera import solve_camera
 from specimap_core.register.model_selection import fit_by_corners
 
 STEP = 1e-4
 """Of a camera's parameter, for derivatives by differences."""
 LEAST_MARKERS = 3
 """Two markers are too few to give a camera and to correct a layout besides."""
+MOVED = 3.0
+"""A marker moved where the corners' scatter exceeds this many standard deviations, and falls by as much without it."""
+LEAST_MOVED_MM = 0.05
+"""A marker that is off by less is not called moved: corners of a blurred cube err by so much."""
 
 
 @dataclass(frozen=True)
 class JointLayout:
     """``adjusted``: cameras and corners by photos and cube; ``scale``: what they multiplied the photos' lengths by.
-    ``square``: the frame camera of square pixels by the corners, None where there is none; ``by_corners``: cameras of
-    every kind by the corners."""
+
+    ``seen``: the corners in the cube, without those of a marker that moved, which ``moved_mm`` names with the distance;
+    ``by_corners``: cameras of every kind by the corners.
+    """
 
     adjusted: Adjusted
     scale: float
-    square: CubeCamera | None
+    seen: CornersInCube
     by_corners: Mapping[Model, CameraFit]
+    moved_mm: Mapping[int, float]
+
+    def warnings(self) -> list[Notice]:
+        """Warnings for the report."""
+        return [
+            Notice(
+                "marker_moved",
+                f"Marker {i} lies {mm:.1f} mm from where the photos show it: it was moved before the cube was"
+                " recorded, or is covered in part. The cube's camera was solved without it.",
+            )
+            for i, mm in self.moved_mm.items()
+        ]
 
 
 def join_cube(seen: CornersInCube, adjusted: Adjusted, rows: int, cols: int) -> JointLayout:
@@ -46,16 +66,18 @@ def join_cube(seen: CornersInCube, adjusted: Adjusted, rows: int, cols: int) -> 
     Raises:
         RegistrationError: no camera sees the corners there.
     """
-    flat = seen.flat()
-    try:
-        square = solve_camera(*flat, rows, cols)
-    except RegistrationError:
-        square = None
-    observed = CubeObservations(*flat, covariance=seen.covariance)
-    by_corners = fit_by_corners(observed, rows, cols, square)
+    by_corners = _by_corners(seen, rows, cols)
+    best = _best(by_corners)
+    moved_mm: dict[int, float] = {}
+    without = _without_moved(seen, best, rows, cols)
+    if without is not None:
+        moved, by_corners = without
+        best = _best(by_corners)
+        moved_mm = {seen.marker_ids[moved]: _off_mm(seen, moved, best)}
+        seen = seen.of(np.arange(len(seen.marker_ids)) != moved)
     if len(seen.marker_ids) < LEAST_MARKERS or seen.covariance is None:
-        return JointLayout(adjusted, 1.0, square, by_corners)
-    best = min(by_corners.values(), key=lambda f: f.cost + f.camera.model.penalty)
+        return JointLayout(adjusted, 1.0, seen, by_corners, moved_mm)
+    flat, observed = seen.flat(), best.observed
     # Corners that no camera explains say as much less of the layout.
     best = fit(best.camera.view, best.camera.model, observed.with_inflated_corner_sigma(max(1.0, best.scatter)))
     at = [adjusted.marker_ids.index(i) for i in seen.marker_ids]
@@ -69,7 +91,47 @@ def join_cube(seen: CornersInCube, adjusted: Adjusted, rows: int, cols: int) -> 
     scale, _, _ = fit_similarity(adjusted.corners.reshape(-1, 3), corners.reshape(-1, 3), with_scale=True)
     poses = tuple(Pose(p.R, p.t * scale) for p in adjusted.poses)
     joint = replace(adjusted, poses=poses, corners=corners, covariance=covariance, scale=adjusted.scale * scale)
-    return JointLayout(joint, scale, square, by_corners)
+    return JointLayout(joint, scale, seen, by_corners, moved_mm)
+
+
+def _by_corners(seen: CornersInCube, rows: int, cols: int) -> dict[Model, CameraFit]:
+    flat = seen.flat()
+    try:
+        square = solve_camera(*flat, rows, cols)
+    except RegistrationError:
+        square = None
+    return fit_by_corners(CubeObservations(*flat, covariance=seen.covariance), rows, cols, square)
+
+
+def _best(by_corners: Mapping[Model, CameraFit]) -> CameraFit:
+    return min(by_corners.values(), key=lambda f: f.cost + f.camera.model.penalty)
+
+
+def _without_moved(
+    seen: CornersInCube, best: CameraFit, rows: int, cols: int
+) -> tuple[int, dict[Model, CameraFit]] | None:
+    """The one marker without which all others fit a camera, and the cameras that they fit; None where there is none."""
+    count = len(seen.marker_ids)
+    if count <= LEAST_MARKERS or best.scatter < MOVED:
+        return None
+    found = []
+    for marker in range(count):
+        with suppress(RegistrationError):
+            fits = _by_corners(seen.of(np.arange(count) != marker), rows, cols)
+            found.append((_best(fits).scatter, marker, fits))
+    if not found:
+        return None
+    scatter, marker, fits = min(found, key=lambda f: f[0])
+    if scatter > best.scatter / MOVED or _off_mm(seen, marker, _best(fits)) < LEAST_MOVED_MM:
+        return None
+    return marker, fits
+
+
+def _off_mm(seen: CornersInCube, marker: int, fitted: CameraFit) -> float:
+    """How far a marker shows from where a camera fitted to the others expects it, mm."""
+    camera = fitted.camera
+    miss = (camera.view.project(seen.corners[marker]) - seen.corners_px[marker]).mean(0)
+    return float(np.linalg.norm(miss * camera.span_mm))
 
 
 def _camera_derivatives(view: View, model: Model, corners: Floats) -> tuple[Floats, Floats]:

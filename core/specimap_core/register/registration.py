@@ -12,6 +12,7 @@ from specimap_core.arrays import Floats
 from specimap_core.bundle_adjust.adjust import Adjusted
 from specimap_core.cloud import CloudPoints
 from specimap_core.cube import Cube
+from specimap_core.notices import Notices
 from specimap_core.register.accuracy import camera_figures, homography_figures
 from specimap_core.register.camera_refinement import RefinedCamera, refine_camera
 from specimap_core.register.corners import corners_in_cube
@@ -56,7 +57,7 @@ class Surface:
 class Registered:
     """A registered cube: its ``points`` by ``method`` on the ``surface``, which that method may have scaled, the
     ``markers`` found in it, its ``camera``, the ``homography``, the ``figures`` of both methods, and ``parallax_mm``
-    (S,), how far apart the methods put each point, NaN where one of them does not."""
+    (S,), how far apart the methods put each point, NaN where one of them does not; ``warnings`` for the report."""
 
     method: Method
     surface: Surface
@@ -66,6 +67,7 @@ class Registered:
     figures: Mapping[str, MethodFigures]
     points: CloudPoints
     parallax_mm: NDArray[np.float32]
+    warnings: Notices
 
 
 def register_cube(
@@ -92,9 +94,10 @@ def register_cube(
     if by_camera:
         surface = surface.scaled(joint)
     adjusted, caster = surface.adjusted, surface.caster
-    refined = refine_camera(by_photos, joint.by_corners, markers, caster, adjusted.corners)
+    refined = refine_camera(joint.seen, joint.by_corners, markers, caster, adjusted.corners)
     camera = refined.camera
     seen = corners_in_cube(markers, adjusted, cube.cols)
+    seen = seen.of(np.isin(seen.marker_ids, joint.seen.marker_ids))
     there = caster
     if refined.followed is not None:
         there = RayCaster(moved_mesh(caster.mesh, refined.followed.motion, adjusted.corners))
@@ -124,4 +127,5 @@ def register_cube(
         "camera": camera_figures(seen, camera.view, caster),
         "homography": homography_figures(by_photos, *grids, settings.ransac_px),
     }
-    return Registered(settings.method, surface, markers, refined, homography, figures, points, parallax_mm)
+    warnings = (*joint.warnings(), *refined.warnings())
+    return Registered(settings.method, surface, markers, refined, homography, figures, points, parallax_mm, warnings)
