@@ -19,7 +19,7 @@ from specimap_core.errors import RegistrationError
 from specimap_core.geometry.cameras import Pose, View, fit_similarity
 from specimap_core.notices import Notice
 from specimap_core.register.camera_fitting import CameraFit, CubeObservations, fit
-from specimap_core.register.camera_models import Model, apply_step, prior_residuals
+from specimap_core.register.camera_models import FRAME, Model, apply_step, prior_residuals
 from specimap_core.register.corners import CornersInCube
 from specimap_core.register.cube_camera import solve_camera
 from specimap_core.register.model_selection import fit_by_corners
@@ -123,6 +123,9 @@ def _without_moved(
         return None
     scatter, marker, fits = min(found, key=lambda f: f[0])
     if scatter > best.scatter / MOVED or _off_mm(seen, marker, _best(fits)) < LEAST_MOVED_MM:
+        return None
+    # Three markers fit a scan of any step and skew: one that wavered would seem to have moved the fourth.
+    if _best(fits).camera.model is not FRAME:
         return None
     return marker, fits
 
