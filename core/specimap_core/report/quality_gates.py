@@ -20,7 +20,8 @@ LEAST_COVERAGE = 0.97
 """Of the cube's pixels between the markers."""
 USELESS_COVERAGE = 0.1
 USELESS_WITHOUT_SPECIMEN = 0.5
-"""Coverage below which a result without any point of a specimen, or from photos that contradict each other, is refused."""
+"""Coverage below which a result without any point of a specimen is refused, and one of photos that contradict each
+other."""
 MOST_CORNER_RMS_PX = 0.8
 OUTLYING_PX = 1.2
 """RMS of a photo's corners; with the following, whichever is more."""
