@@ -138,6 +138,8 @@ class CameraFit:
         return float(np.sqrt(2) * SIGMA_OF_MAD * np.median(np.abs(miss_mm)))
 
 
+MOST_STEPS = 40
+"""A fit that has not converged by then is to corners that no camera explains, and its numbers mean little."""
 POSE_PARAMETERS = 6
 """Number of a model's parameters, from the first, that are its pose."""
 
@@ -195,6 +197,7 @@ def fit(
             args=(base, observed.prior_through(base)),
             x_scale=np.append(PARAMETER_SCALES[list(model.parameters[:free])], MOTION_SCALES[: many - free]),
             loss=robust,
+            max_nfev=MOST_STEPS,
         )
         # Once more from there: steps and covariance are then about the camera that is given.
         base = at_markers(apply_step(base, model.step(answer.x[:free])))

@@ -116,18 +116,19 @@ def _without_moved(
         return None
     found = []
     for marker in range(count):
+        others = seen.of(np.arange(count) != marker)
         with suppress(RegistrationError):
-            fits = _by_corners(seen.of(np.arange(count) != marker), rows, cols)
-            found.append((_best(fits).scatter, marker, fits))
+            # Three markers fit a scan of any step and skew: one that wavered would seem to have moved the fourth.
+            square = solve_camera(*others.flat(), rows, cols)
+            observed = CubeObservations(*others.flat(), covariance=others.covariance)
+            found.append((fit(square.view, FRAME, observed), marker, others))
     if not found:
         return None
-    scatter, marker, fits = min(found, key=lambda f: f[0])
-    if scatter > best.scatter / MOVED or _off_mm(seen, marker, _best(fits)) < LEAST_MOVED_MM:
+    fitted, marker, others = min(found, key=lambda f: f[0].scatter)
+    if fitted.scatter > best.scatter / MOVED or _off_mm(seen, marker, fitted) < LEAST_MOVED_MM:
         return None
-    # Three markers fit a scan of any step and skew: one that wavered would seem to have moved the fourth.
-    if _best(fits).camera.model is not FRAME:
-        return None
-    return marker, fits
+    fits = _by_corners(others, rows, cols)
+    return (marker, fits) if _best(fits).camera.model is FRAME else None
 
 
 def _off_mm(seen: CornersInCube, marker: int, fitted: CameraFit) -> float:
