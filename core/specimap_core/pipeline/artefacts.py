@@ -33,7 +33,7 @@ DEPTH_STEPS = 65534
 GRIDS = ("coarse", "fine")
 IMAGES = ("depth_", "colour_", "confidence_", "turn_", "greys")
 """Arrays of stage 1 that stage 2 alone needs: hundreds of megabytes."""
-FORMAT = 4
+FORMAT = 5
 """Counts up when what a stage saves, or how a stage computes it, changes: older artefacts are then not reused."""
 
 
