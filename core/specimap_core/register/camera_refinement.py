@@ -32,8 +32,6 @@ LOOSE_MM = 0.1
 """Lateral standard deviation at the specimen from which on the camera is called loose."""
 EXPLAINED_BY_CAMERA = 3.0
 """A shift within so many standard deviations of the camera is the camera's, not the specimen's."""
-JOINT_SD_MM = 0.03
-"""Standard deviation of the error that all tiles share, where they determine more of a camera than its centre."""
 MOTION_OVER_MISFIT = 3.0
 """A motion counts as one, and not as a cube that no camera fits, where it is so many times the corners' misfit."""
 SQUARE = 0.005
@@ -141,7 +139,7 @@ def refine_camera(
     if not len(sample):
         return RefinedCamera(camera, alone.lateral_sd_mm(seen.flat()[0]), False, None, misfit_mm=choice.misfit_mm)
     marker_sd_mm = alone.lateral_sd_mm(sample)
-    joint_sd_mm = float(np.hypot(camera.lateral_sd_mm(sample), JOINT_SD_MM)) if choice.specimen_used else None
+    joint_sd_mm = camera.lateral_sd_mm(sample) if choice.specimen_used else None
     shift = motion_of_tiles(last) if choice.moved and (last := measure(camera.view)) is not None else None
     found_camera = RefinedCamera(
         camera, marker_sd_mm, choice.specimen_used, shift, joint_sd_mm, choice.ambiguity_mm, choice.misfit_mm
@@ -149,5 +147,5 @@ def refine_camera(
     if not found_camera.moved:
         return found_camera
     followed = follow_motion(choice.fit, observed, measure_through, caster, corners, sample)
-    joint_sd_mm = float(np.hypot(followed.fit.specimen_sd_mm(sample), JOINT_SD_MM))
+    joint_sd_mm = followed.fit.specimen_sd_mm(sample)
     return replace(found_camera, camera=followed.fit.camera, joint_sd_mm=joint_sd_mm, followed=followed)

@@ -14,14 +14,13 @@ from specimap_core.geometry.cameras import fit_similarity
 from specimap_core.pipeline.outputs import Inputs
 from specimap_core.pipeline.run import run_pipeline
 from specimap_core.pipeline.settings import PipelineSettings
-from specimap_core.register.camera_fitting import CubeObservations
-from specimap_core.register.camera_refinement import JOINT_SD_MM, LOOSE_MM, RefinedCamera, refine_camera
+from specimap_core.register.camera_fitting import SHARED_MM, CubeObservations
+from specimap_core.register.camera_refinement import LOOSE_MM, RefinedCamera, refine_camera
 from specimap_core.register.corners import CornersInCube, corners_in_cube
 from specimap_core.register.cube_camera import CubeCamera, solve_camera
 from specimap_core.register.cube_markers import CubeMarkers, find_markers
 from specimap_core.register.joint_layout import join_cube
 from specimap_core.register.model_selection import fit_by_corners
-from specimap_core.register.specimen_motion import SHARED_MM
 from specimap_core.report.model import Report
 from specimap_core.surface.raycast import RayCaster
 from specimap_core.truth.judge import judge, judge_with_sigma
@@ -102,8 +101,7 @@ def test_four_sharp_markers_hold_the_camera_and_the_specimen_agrees(
     assert refined.specimen_used
     assert refined.warnings() == []
     assert refined.shift is None
-    assert max(refined.marker_sd_mm, JOINT_SD_MM / 2) < LOOSE_MM
-    assert 0 < refined.lateral_sd_mm < np.hypot(refined.marker_sd_mm, JOINT_SD_MM)
+    assert 0 < refined.lateral_sd_mm < refined.marker_sd_mm < LOOSE_MM
     assert 0.001 < found.after_mm < 2 * refined.lateral_sd_mm
 
 
@@ -118,7 +116,7 @@ def test_what_markers_leave_open_the_specimen_settles(
     for found in cases:
         refined = found.refined
         assert found.after_mm < 3 * refined.lateral_sd_mm
-        assert JOINT_SD_MM <= refined.lateral_sd_mm < refined.marker_sd_mm
+        assert SHARED_MM / 2 < refined.lateral_sd_mm < refined.marker_sd_mm
         assert refined.warnings() == []
     before, after = (float(np.median(m)) for m in zip(*((c.before_mm, c.after_mm) for c in cases), strict=True))
     assert before > LOOSE_MM
