@@ -17,6 +17,7 @@ from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.register.camera_refinement import refine_camera
 from specimap_core.register.corners import CornersInCube, corners_in_cube
 from specimap_core.register.cube_markers import find_markers
+from specimap_core.register.joint_layout import join_cube
 from specimap_core.register.placement import Placement, place_by_camera
 from specimap_core.surface.raycast import RayCaster
 from specimap_core.truth.judge import SPECIMEN
@@ -28,17 +29,20 @@ class Scene:
     takes the truth's frame into the run's."""
 
     def __init__(self, folder: Path, truth: Truth, stage1: Stage1, stage2: Stage2, settings: PipelineSettings) -> None:
-        self.truth, self.adjusted = truth, stage2.adjusted
+        self.truth = truth
         self._stage1 = stage1
         cube = open_cube(next((folder / "hsi").glob("*.hdr")))
         found = find_markers(cube, settings.reconstruct.dictionary, stage2.adjusted.marker_ids)
         seen: CornersInCube = corners_in_cube(found, stage2.adjusted, cube.cols)
-        self.caster = RayCaster(stage2.mesh)
-        self.refined = refine_camera(seen, found, cube.rows, cube.cols, self.caster, stage2.adjusted.corners)
+        joint = join_cube(seen, stage2.adjusted, cube.rows, cube.cols)
+        self.adjusted = joint.adjusted
+        vertices = (stage2.mesh.vertices * joint.scale).astype(np.float32)
+        self.caster = RayCaster(replace(stage2.mesh, vertices=vertices))
+        self.refined = refine_camera(joint.seen, joint.by_corners, found, self.caster, self.adjusted.corners)
         self.camera = self.refined.camera.view
         ids = list(truth.marker_ids)
-        self.true_corners = truth.marker_corners[[ids.index(i) for i in stage2.adjusted.marker_ids]]
-        _, R, t = fit_similarity(self.true_corners.reshape(-1, 3), stage2.adjusted.corners.reshape(-1, 3))
+        self.true_corners = truth.marker_corners[[ids.index(i) for i in self.adjusted.marker_ids]]
+        _, R, t = fit_similarity(self.true_corners.reshape(-1, 3), self.adjusted.corners.reshape(-1, 3))
         self.ours = Pose(R, t)
         self.true_camera = truth.hsi_view.after(self.ours.inverse())
 

@@ -97,6 +97,9 @@ CATALOGUE = MappingProxyType(
         "cube_camera_not_frame": NoticeKind("register", "the cube was recorded by a push-broom camera"),
         "cube_camera_loose": NoticeKind("register", "the markers leave the cube's camera open"),
         "cube_camera_unfit": NoticeKind("register", "no camera model fits the markers and the specimen in the cube"),
+        "marker_moved": NoticeKind(
+            "register", "a marker lies elsewhere in the cube than in the photos; it was left out"
+        ),
         "specimen_moved": NoticeKind("register", "the specimen moved between the photos and the cube"),
         "points_no_data": NoticeKind("cloud", "some points lack a value in a good band"),
         "values_clipped": NoticeKind("cloud", "some values were stored as the least or the largest that a cloud holds"),

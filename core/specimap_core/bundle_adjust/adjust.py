@@ -102,7 +102,7 @@ def adjust(
         corners_of(squares, settings.edge_mm) if squares else start,
         squares,
     )
-    solved, info = solve(scene, inner, edge_mm=settings.edge_mm, refine_lens=rigid, robust=rigid)
+    solved, info = solve(scene, inner, edge_mm=settings.edge_mm, refine_lens=rigid, robust=rigid, growth=rigid)
     if not rigid:
         factor = settings.edge_mm / float(edge_lengths(solved.corners).mean())
         solved = MarkerScene(

@@ -7,7 +7,6 @@ import numpy as np
 from specimap_core.arrays import Floats
 from specimap_core.bundle_adjust.solver import MarkerScene, SolveInfo
 from specimap_core.geometry.cameras import skew
-from specimap_core.geometry.projection import LENS
 
 
 def corner_covariance(scene: MarkerScene, info: SolveInfo) -> Floats:
@@ -17,7 +16,8 @@ def corner_covariance(scene: MarkerScene, info: SolveInfo) -> Floats:
     Baarda 1973), so that a variance is that of a corner's place within the layout.
     """
     Q = len(scene.corners)
-    start = LENS + 6 * len(scene.poses)
+    shared, photo, _ = scene.sizes
+    start = shared + photo * len(scene.poses)
     full = np.linalg.pinv(info.normal, rcond=1e-12, hermitian=True)
     block = full[start:, start:]
     if scene.squares is not None:

@@ -37,3 +37,15 @@ def square_corners(edge_mm: float) -> Floats:
 def corners_of(squares: tuple[Pose, ...], edge_mm: float) -> Floats:
     """World corners (Q, 4, 3) mm of square markers with poses ``world_from_marker``."""
     return np.stack([s.apply(square_corners(edge_mm)) for s in squares])
+
+
+def corner_shifts(corners_px: Floats) -> Floats:
+    """By how much (..., 4, 2) the corners (..., 4, 2) of squares move where each edge moves outward by one pixel."""
+    along = np.roll(corners_px, -1, -2) - corners_px
+    normal = np.stack([along[..., 1], -along[..., 0]], -1)
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    outward = ((corners_px - corners_px.mean(-2, keepdims=True)) * normal).sum(-1, keepdims=True)
+    normal = normal * np.where(outward < 0, -1.0, 1.0) / np.maximum(length, 1e-12)
+    before = np.roll(normal, 1, -2)
+    # n1 . d = n2 . d = 1: along the bisector, further where the edges meet at a smaller angle.
+    return np.asarray((before + normal) / np.maximum(1 + (before * normal).sum(-1, keepdims=True), 1e-3))

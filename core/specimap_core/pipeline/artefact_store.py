@@ -16,7 +16,7 @@ from specimap_core import __version__
 from specimap_core.atomic import atomic_path, remove
 from specimap_core.json_text import json_text
 
-FORMAT = 4
+FORMAT = 5
 """Counts up when what a stage saves, or how a stage computes it, changes: older artefacts are then not reused."""
 
 

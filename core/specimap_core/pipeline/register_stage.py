@@ -49,7 +49,7 @@ def register_stage(
     clock: Clock,
 ) -> Report:
     """Stage 4; all results appear in ``outputs`` together, the report last."""
-    cube, adjusted = given.cube, surface.adjusted
+    cube = given.cube
     with clock.stage("register") as progress:
         try:
             registered = register_cube(
@@ -61,6 +61,7 @@ def register_stage(
             )
         except MarkersMissingInCubeError as error:
             raise with_assumptions(error, cube.warnings) from error
+        adjusted = registered.surface.adjusted
         run = RunRecord(settings, given.hashes, clock.seconds, clock.reused, given.warnings)
         report = gated(build_report(stage1, adjusted, registered, run), settings.adjust.edge_mm)
 
@@ -70,7 +71,7 @@ def register_stage(
             return {"report": report.summary(), "settings": settings.as_dict(), "inputs": dict(given.hashes)}
 
         with staged(outputs) as aside:
-            write_mesh_ply(aside.mesh, surface.caster.mesh)
+            write_mesh_ply(aside.mesh, registered.surface.caster.mesh)
             named = zip(adjusted.marker_ids, adjusted.corners, strict=True)
             write_text(aside.corners, json_text({str(i): np.round(c, 6).tolist() for i, c in named}, indent=1))
             write_cloud(

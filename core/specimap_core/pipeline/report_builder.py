@@ -93,7 +93,7 @@ def build_report(stage1: Stage1, adjusted: Adjusted, registered: Registered, run
         photo_focal_px=adjusted.lens.focal_px,
         seconds=dict(run.seconds),
         reused_stages=list(run.reused),
-        warnings=[*run.warnings, *run_warnings(stage1, adjusted, markers), *registered.camera.warnings()],
+        warnings=[*run.warnings, *run_warnings(stage1, adjusted, markers), *registered.warnings],
         settings=settings.as_dict(),
         inputs=dict(run.hashes),
         photo_corners=photo_corners(stage1, adjusted),

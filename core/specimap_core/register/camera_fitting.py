@@ -19,21 +19,43 @@ from specimap_core.register.camera_models import (
     model_of,
     prior_residuals,
 )
+from specimap_core.register.corner_prior import CornerPrior
 from specimap_core.register.cube_camera import LEAST_SCATTER, CubeCamera, solve_camera
 from specimap_core.register.tile_offsets import TileOffsets
 
-MOTION_SCALES = np.array([0.1, 0.1, 0.01])
-"""Typical change of a shift in mm and a turn in rad."""
+MOTION_SCALES = np.array([0.01] * 3 + [0.1] * 3)
+"""Typical change of a turn in rad and a shift in mm."""
+MOTION_SD = np.array([0.02, 0.02, 0.1, 3.0, 3.0, 0.2])
+"""Standard deviations of a specimen's tilts and turn in rad and of its shift in mm: it is nudged or laid down anew on a
+tray, and what a cube hardly shows, a lift, is not made use of."""
+NO_MOTION = np.zeros(len(MOTION_SCALES))
+SHARED_MM = 0.02
+"""Standard deviation, along an axis, of the error that all tiles share: seen through the true camera, specimens that
+did not move show 0.00 to 0.01 mm on own phantoms and 0.02 to 0.03 mm on path-traced ones."""
+SHARED = 2
+"""Unknowns of that error."""
+
+
+def moved(points: Floats, motion: Floats, middle: Floats) -> Floats:
+    """Points (..., 3) mm turned by the rotation vector ``motion[:3]`` rad about ``middle`` (3,), and shifted by
+    ``motion[3:]`` mm."""
+    return np.asarray((points - middle) @ rotation_from_vector(motion[:3]).T + middle + motion[3:])
 
 
 @dataclass(frozen=True)
 class TileObservations:
     """Where the specimen shows: ``points`` (T, S, 3) mm of each tile, their mean place ``pixels`` (T, 2) in the cube as
-    found, and its ``sigma_px`` (2,)."""
+    found, its ``sigma_px`` (2,), and what a pixel spans there, ``mm_per_px`` (2,)."""
 
     points: Floats
     pixels: Floats
     sigma_px: Floats
+    mm_per_px: Floats
+
+    @property
+    def middle(self) -> Floats:
+        """The middle (3,) of all tiles, mm, about which a motion turns."""
+        return np.asarray(self.points.mean((0, 1)))
 
     @staticmethod
     def of(measured: TileOffsets, sigma_mm: float) -> TileObservations:
@@ -41,27 +63,31 @@ class TileObservations:
         kept = np.isfinite(measured.offsets[:, 0]) & (measured.weight > 0)
         points = measured.points[kept]
         pixels = measured.view.project(points).mean(1) + measured.offsets[kept] / measured.scale
-        return TileObservations(points, pixels, sigma_mm / measured.view.mm_per_px(measured.depth_mm))
+        mm_per_px = measured.view.mm_per_px(measured.depth_mm)
+        return TileObservations(points, pixels, sigma_mm / mm_per_px, mm_per_px)
 
-    def miss(self, view: View, motion: Floats) -> Floats:
-        """By how many standard deviations (T, 2) ``view`` expects it elsewhere, the specimen shifted by ``motion[:2]``
-        mm and turned by ``motion[2]`` rad."""
-        points = self.points
-        if motion.any():
-            middle = points.mean((0, 1))
-            R = rotation_from_vector(np.array([0.0, 0.0, motion[2]]))
-            points = (points - middle) @ R.T + middle + [motion[0], motion[1], 0.0]
-        return np.asarray((view.project(points).mean(1) - self.pixels) / self.sigma_px)
+    def miss(self, view: View, motion: Floats, shared_mm: Floats) -> Floats:
+        """By how many standard deviations (T, 2) ``view`` expects it elsewhere, the specimen moved by ``motion`` (6,):
+        a rotation vector about the tiles' middle, rad, and a shift, mm. All tiles were measured ``shared_mm`` (2,) away
+        from their places, across and down."""
+        points = moved(self.points, motion, self.middle) if motion.any() else self.points
+        return np.asarray((view.project(points).mean(1) + shared_mm / self.mm_per_px - self.pixels) / self.sigma_px)
 
 
 @dataclass(frozen=True)
 class CubeObservations:
-    """Observations in the cube: ``corners`` (N, 3) mm at ``pixels`` (N, 2) with ``sigma_px`` (N,), and ``tiles``."""
+    """Observations in the cube: ``corners`` (N, 3) mm at ``pixels`` (N, 2) with ``sigma_px`` (N,), and ``tiles``;
+    ``covariance`` (3 N, 3 N) mm^2 of the corners' own places, None where they are known."""
 
     corners: Floats
     pixels: Floats
     sigma_px: Floats
     tiles: TileObservations | None = None
+    covariance: Floats | None = None
+
+    def prior_through(self, view: View) -> CornerPrior:
+        """The corners as ``view`` sees them, with the errors of their places."""
+        return CornerPrior.of(view, self.corners, self.sigma_px, self.covariance)
 
     def with_inflated_corner_sigma(self, factor: float) -> CubeObservations:
         """The same with the corners' standard deviations ``factor`` times as large."""
@@ -77,19 +103,40 @@ class CubeObservations:
 class CameraFit:
     """A ``camera`` fitted to what was ``observed``.
 
-    ``cost``: robust chi squared of the observations and priors; ``motion`` (3,): shift mm and turn rad of the specimen,
-    zero where it was taken to have stayed; ``scatter``: root mean square of the corners' residuals in standard
-    deviations; ``dof_factor``: root of observations over degrees of freedom, by which fitting makes residuals smaller;
-    ``tile_miss`` (T, 2): residuals of the tiles in their standard deviations.
+    ``cost``: robust chi squared of the observations and priors; ``motion`` (6,): turn rad and shift mm of the specimen,
+    zero where it was taken to have stayed; ``corner_shift`` (N, 3) mm: by how much the cube moves the corners from
+    where the photos put them; ``scatter``: root mean square of the corners' residuals in standard deviations;
+    ``dof_factor``: root of observations over degrees of freedom, by which fitting makes residuals smaller;
+    ``tile_miss`` (T, 2): residuals of the tiles in their standard deviations; ``covariance`` (n, n) of the camera's
+    parameters, where it may have moved the specimen's motion, and the error that the tiles share.
     """
 
     camera: CubeCamera
     observed: CubeObservations
     cost: float
     motion: Floats
+    corner_shift: Floats
     scatter: float
     dof_factor: float
     tile_miss: Floats
+    covariance: Floats
+
+    def specimen_sd_mm(self, places: Floats) -> float:
+        """Lateral standard deviation at ``places`` (N, 3) mm of the specimen, root mean square, by the uncertainty of
+        the camera and of a motion together."""
+        free, view, tiles = self.camera.model.free, self.camera.view, self.observed.tiles
+        if tiles is None or not self.motion.any():
+            return self.camera.lateral_sd_mm(places)
+        step, middle, columns = 1e-4, tiles.middle, []
+        many = free + len(self.motion)
+        for e in step * np.eye(many):
+            ahead, back = (
+                apply_step(view, self.camera.model.step(s * e[:free])).project(moved(places, s * e[free:], middle))
+                for s in (1, -1)
+            )
+            columns.append((ahead - back) / (2 * step))
+        J = np.stack(columns, -1) * self.camera.span_mm[:, None]
+        return float(np.sqrt(np.maximum(np.einsum("nij,jk,nik->n", J, self.covariance[:many, :many], J), 0).mean()))
 
     @property
     def tile_mm(self) -> float:
@@ -100,6 +147,8 @@ class CameraFit:
         return float(np.sqrt(2) * SIGMA_OF_MAD * np.median(np.abs(miss_mm)))
 
 
+MOST_STEPS = 40
+"""A fit that has not converged by then is to corners that no camera explains, and its numbers mean little."""
 POSE_PARAMETERS = 6
 """Number of a model's parameters, from the first, that are its pose."""
 
@@ -126,15 +175,19 @@ def fit(
         RegistrationError: the fit ends with a scan's camera below the markers.
     """
     free = model.free if free is None else free
-    many = free + (3 if motion else 0)
-    weight = 1 / np.maximum(observed.sigma_px, 1e-3)[:, None]
     corners, tiles = 2 * len(observed.corners), observed.tiles
+    moving = slice(free, free + (len(NO_MOTION) if motion else 0))
+    sharing = slice(moving.stop, moving.stop + (0 if tiles is None else SHARED))
 
-    def residual(x: Floats, base: View) -> Floats:
-        view = apply_step(base, x[:free])
-        parts = [((view.project(observed.corners) - observed.pixels) * weight).ravel(), np.array(prior_residuals(view))]
+    def residual(x: Floats, base: View, prior: CornerPrior) -> Floats:
+        view = apply_step(base, model.step(x[:free]))
+        miss = view.project(observed.corners) - observed.pixels
+        parts = [prior.whiten(miss), np.array(prior_residuals(view))]
         if tiles is not None:
-            parts.append(tiles.miss(view, x[free:] if motion else np.zeros(3)).ravel())
+            parts.append(tiles.miss(view, x[moving] if motion else NO_MOTION, x[sharing]).ravel())
+            parts.append(x[sharing] / SHARED_MM)
+        if motion:
+            parts.append(x[moving] / MOTION_SD)
         return np.concatenate(parts)
 
     def robust(z: Floats) -> Floats:
@@ -142,25 +195,36 @@ def fit(
         rho = np.empty((3, len(z)))
         root = np.sqrt(1 + z)
         rho[0], rho[1], rho[2] = 2 * (root - 1), 1 / root, -0.5 / root**3
-        far = slice(corners + len(prior_residuals(start)), None)
+        first = corners + len(prior_residuals(start))
+        far = slice(first, first + (0 if tiles is None else 2 * len(tiles.pixels)))
         rho[0, far], rho[1, far], rho[2, far] = np.log1p(z[far]), 1 / (1 + z[far]), -1 / (1 + z[far]) ** 2
         return rho
 
-    x, base = np.zeros(many), start
+    scales = (
+        PARAMETER_SCALES[list(model.parameters[:free])],
+        MOTION_SCALES[: moving.stop - moving.start],
+        np.full(sharing.stop - sharing.start, SHARED_MM),
+    )
+    x, base = np.zeros(sharing.stop), start
     for _ in range(2):
         answer = least_squares(
             residual,
             x,
-            args=(base,),
-            x_scale=np.append(PARAMETER_SCALES[:free], MOTION_SCALES[: many - free]),
+            args=(base, observed.prior_through(base)),
+            x_scale=np.concatenate(scales),
             loss=robust,
+            max_nfev=MOST_STEPS,
         )
         # Once more from there: steps and covariance are then about the camera that is given.
-        base, x = at_markers(apply_step(base, answer.x[:free])), np.append(np.zeros(free), answer.x[free:])
-    miss = base.project(observed.corners) - observed.pixels
-    scatter = float(((miss * weight) ** 2).sum()) / max(corners - free, 1)
+        base = at_markers(apply_step(base, model.step(answer.x[:free])))
+        x = np.append(np.zeros(free), answer.x[free:])
+    miss, prior = base.project(observed.corners) - observed.pixels, observed.prior_through(base)
+    scatter = float((prior.whiten(miss) ** 2).sum()) / max(corners - free, 1)
+    corner_shift = prior.shift(miss)
+    miss = miss + prior.seen_shift(corner_shift)
     dof_factor = float(np.sqrt(corners / max(corners - free, 1)))
-    covariance = (np.linalg.pinv(answer.jac.T @ answer.jac) * max(LEAST_SCATTER, scatter))[:free, :free]
+    whole = np.linalg.pinv(answer.jac.T @ answer.jac) * max(LEAST_SCATTER, scatter)
+    covariance = whole[:free, :free]
     camera = CubeCamera(
         base,
         float(np.sqrt((miss**2).sum(-1).mean())),
@@ -168,6 +232,16 @@ def fit(
         covariance,
         model,
     )
-    shift = x[free:] if motion else np.zeros(3)
-    tile_miss = tiles.miss(base, shift) if tiles is not None else np.empty((0, 2))
-    return CameraFit(camera, observed, float(2 * answer.cost), shift, float(np.sqrt(scatter)), dof_factor, tile_miss)
+    shift = x[moving] if motion else NO_MOTION
+    tile_miss = tiles.miss(base, shift, x[sharing]) if tiles is not None else np.empty((0, 2))
+    return CameraFit(
+        camera,
+        observed,
+        float(2 * answer.cost),
+        shift,
+        corner_shift,
+        float(np.sqrt(scatter)),
+        dof_factor,
+        tile_miss,
+        whole,
+    )

@@ -1,7 +1,7 @@
 """Camera models of a cube, as parameters about a given view, and where a solution of each starts.
 
-Ten parameters describe all of them: a turn, a shift, the logarithms of the focal length and of the pixel's aspect, and
-of a scan its skew and climb. A frame camera of square pixels has the first seven.
+Eleven parameters describe all of them: a turn, a shift, the logarithms of the focal length and of the pixel's aspect,
+of a scan its skew and climb, and of a frame camera the radial distortion of its lens.
 """
 
 from __future__ import annotations
@@ -34,19 +34,33 @@ ASPECT_RANGE = (0.25, 4.0)
 """Heights over widths of a pixel that are believed."""
 MODEL_PENALTY = 8.0
 """Chi squared that another model must gain over a frame camera of square pixels."""
-PARAMETERS = 10
-PARAMETER_SCALES = np.array([1e-3] * 3 + [1.0] * 3 + [0.1, 0.01, 0.01, 0.01])
+RADIAL_SD = 0.004
+"""Of the shift that the lens of a frame camera causes at the image's corner, as a share of the corner's distance from
+the middle: lenses of hyperspectral cameras distort by up to one per cent there."""
+PARAMETERS = 11
+PARAMETER_SCALES = np.array([1e-3] * 3 + [1.0] * 3 + [0.1, 0.01, 0.01, 0.01, 0.001])
 """Typical change of each parameter."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """A ``kind`` of camera; ``free``: how many of the ten parameters it has, from the first; ``penalty``: chi squared
-    that it must gain over a frame camera of square pixels."""
+    """A ``kind`` of camera; ``parameters``: which of the eleven it has; ``penalty``: chi squared that it must gain over
+    a frame camera of square pixels."""
 
     kind: Kind
-    free: int
+    parameters: tuple[int, ...]
     penalty: float
+
+    @property
+    def free(self) -> int:
+        """How many parameters it has."""
+        return len(self.parameters)
+
+    def step(self, x: Floats) -> Floats:
+        """A step of the first ``len(x)`` of its parameters as one of all eleven, for :func:`apply_step`."""
+        full = np.zeros(PARAMETERS)
+        full[list(self.parameters[: len(x)])] = x
+        return full
 
     @property
     def scan(self) -> Axis | None:
@@ -60,9 +74,13 @@ class Model:
         return "frame" if self.kind == "frame_aspect" else self.kind
 
 
-FRAME = Model("frame", 7, 0.0)
-ASPECT = Model("frame_aspect", 8, MODEL_PENALTY)
-SCANS = Model("scan_rows", PARAMETERS, MODEL_PENALTY), Model("scan_columns", PARAMETERS, MODEL_PENALTY)
+_RADIAL = PARAMETERS - 1
+FRAME = Model("frame", (*range(7), _RADIAL), 0.0)
+ASPECT = Model("frame_aspect", (*range(8), _RADIAL), MODEL_PENALTY)
+SCANS = (
+    Model("scan_rows", tuple(range(_RADIAL)), MODEL_PENALTY),
+    Model("scan_columns", tuple(range(_RADIAL)), MODEL_PENALTY),
+)
 
 
 def model_of(view: View) -> Model:
@@ -74,14 +92,16 @@ def model_of(view: View) -> Model:
 
 def apply_step(view: View, x: Floats) -> View:
     """``view`` turned by ``x[:3]``, shifted by ``x[3:6]``, its focal length ``exp(x[6])`` as long and its distance with
-    it; its pixels ``exp(x[7])`` as high; with ``x[8]`` more skew and ``x[9]`` more climb."""
+    it; its pixels ``exp(x[7])`` as high; with ``x[8]`` more skew, ``x[9]`` more climb and ``x[10]`` more radial
+    distortion at the image's corner."""
     x = np.append(x, np.zeros(PARAMETERS - len(x)))
     lens, pose = view.intrinsics, view.cam_from_world
     zoom, higher = (float(v) for v in np.exp(x[6:8]))
     turned = rotation_from_vector(x[:3]) @ pose.R
     focal_px, aspect = lens.focal_px * zoom, lens.aspect * higher
     if not isinstance(view, ScanView):
-        lens = replace(Intrinsics.centred(lens.width, lens.height, focal_px), aspect=aspect)
+        k1 = (radial_at_corner(lens) + float(x[10])) / _corner_square(lens.width, lens.height, focal_px)
+        lens = replace(Intrinsics.centred(lens.width, lens.height, focal_px, k1), aspect=aspect)
         return View(lens, Pose(turned, pose.t * zoom + x[3:6]))
     # Along the scan nothing changes with distance, and lines further apart leave the lens as it is.
     if view.along == 0:
@@ -92,6 +112,16 @@ def apply_step(view: View, x: Floats) -> View:
     return ScanView(
         lens, Pose(turned, t), view.scan, view.skew + float(x[8]), view.climb + float(x[9]), view.depth_mm * zoom
     )
+
+
+def radial_at_corner(lens: Intrinsics) -> float:
+    """By which share of its distance from the middle the image's corner is shifted by the first radial term."""
+    return lens.k1 * _corner_square(lens.width, lens.height, lens.focal_px)
+
+
+def _corner_square(width: int, height: int, focal_px: float) -> float:
+    """Square of the corner's distance from the middle, in focal lengths."""
+    return (width**2 + height**2) / 4 / focal_px**2
 
 
 def at_markers(view: View) -> View:
@@ -131,7 +161,7 @@ def prior_residuals(view: View) -> list[float]:
         up = pose.R[:, 2]
         level = up[s] + view.skew * up[o] + view.climb * up[2]
         return [*off, up[o] / TILT_SD, up[s] / TILT_SD, level / CLIMB_SD, view.skew / SKEW_SD]
-    return [*off, pose.R[0, 2] / TILT_SD, pose.R[1, 2] / TILT_SD]
+    return [*off, pose.R[0, 2] / TILT_SD, pose.R[1, 2] / TILT_SD, radial_at_corner(lens) / RADIAL_SD]
 
 
 @dataclass(frozen=True)

@@ -8,24 +8,23 @@ where it lies to 0.03 mm; corners and specimen together give the camera, each by
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from specimap_core.arrays import Floats
-from specimap_core.errors import RegistrationError
-from specimap_core.geometry.cameras import View
 from specimap_core.geometry.pushbroom import ScanView
 from specimap_core.notices import Notice
-from specimap_core.register.camera_fitting import CubeObservations
-from specimap_core.register.camera_models import FRAME
+from specimap_core.register.camera_fitting import CameraFit, CubeObservations
+from specimap_core.register.camera_models import Model
 from specimap_core.register.corners import CornersInCube
-from specimap_core.register.cube_camera import Anchor, CubeCamera, solve_camera
+from specimap_core.register.cube_camera import CubeCamera
 from specimap_core.register.cube_markers import CubeMarkers
-from specimap_core.register.model_selection import SelectedCamera, select_camera
-from specimap_core.register.specimen_motion import LEAST_MARKERS, Shift, motion_of_tiles
-from specimap_core.register.tile_offsets import TileOffsets, measure_tile_offsets
+from specimap_core.register.model_selection import MeasureOffsets, select_camera
+from specimap_core.register.motion_repair import FollowedMotion, follow_motion
+from specimap_core.register.specimen_motion import Shift, motion_of_tiles
+from specimap_core.register.tile_offsets import measure_tile_offsets
 from specimap_core.surface.raycast import RayCaster
 from specimap_core.surface.regions import raised_mm
 
@@ -33,8 +32,6 @@ LOOSE_MM = 0.1
 """Lateral standard deviation at the specimen from which on the camera is called loose."""
 EXPLAINED_BY_CAMERA = 3.0
 """A shift within so many standard deviations of the camera is the camera's, not the specimen's."""
-JOINT_SD_MM = 0.03
-"""Standard deviation of the error that all tiles share, where they determine more of a camera than its centre."""
 MOTION_OVER_MISFIT = 3.0
 """A motion counts as one, and not as a cube that no camera fits, where it is so many times the corners' misfit."""
 SQUARE = 0.005
@@ -62,6 +59,7 @@ class RefinedCamera:
     joint_sd_mm: float | None = None
     model_sd_mm: float = 0.0
     misfit_mm: float = 0.0
+    followed: FollowedMotion | None = None
 
     @property
     def moved(self) -> bool:
@@ -72,7 +70,7 @@ class RefinedCamera:
     @property
     def lateral_sd_mm(self) -> float:
         """Lateral standard deviation of a registered pixel of the specimen."""
-        if self.shift is not None and self.moved:
+        if self.shift is not None and self.moved and self.followed is None:
             # Spectra are off their places by this much, and the camera may add its own error.
             return float(np.hypot(self.shift.moved_mm, self.camera_sd_mm))
         return self.camera_sd_mm
@@ -99,7 +97,13 @@ class RefinedCamera:
             text = f"The cube's pixels are {aspect:.3f} times as high as they are wide; this was accounted for."
             warnings.append(Notice("cube_pixels_not_square", text))
         if self.shift is not None and self.moved:
-            warnings.append(Notice("specimen_moved", self.shift.message))
+            text = self.shift.message
+            if self.followed is not None:
+                text += (
+                    f" The motion, {self.followed.moved_mm:.1f} mm with a turn of {self.followed.turn_deg:.1f} degrees,"
+                    " was followed as that of a rigid body; a bend was not."
+                )
+            warnings.append(Notice("specimen_moved", text))
         if self.misfit_mm:
             text = f"No camera sees markers and specimen as the cube shows them: about {self.misfit_mm:.2f} mm remain."
             warnings.append(Notice("cube_camera_unfit", text))
@@ -110,87 +114,38 @@ class RefinedCamera:
 
 
 def refine_camera(
-    seen: CornersInCube, found: CubeMarkers, rows: int, cols: int, caster: RayCaster, corners: Floats
+    seen: CornersInCube,
+    by_corners: Mapping[Model, CameraFit],
+    found: CubeMarkers,
+    caster: RayCaster,
+    corners: Floats,
 ) -> RefinedCamera:
-    """Solve the cube's camera on the corners ``seen``; ``found``: the markers with the image they show in;
-    ``corners`` (Q, 4, 3) mm of all markers.
+    """Solve the cube's camera by the corners ``seen`` and the specimen.
 
-    Raises:
-        RegistrationError: no camera above the plane sees the corners there.
+    ``by_corners``: cameras of every kind by the corners alone; ``found``: the markers with the image they show in;
+    ``corners`` (Q, 4, 3) mm of all markers.
     """
-    flat = seen.flat()
-    try:
-        square = solve_camera(*flat, rows, cols)
-    except RegistrationError:
-        square = None
     vertices = caster.mesh.vertices
     raised = vertices[vertices[:, 2] > raised_mm(corners)].astype(float)
     sample = raised[:: max(1, len(raised) // SAMPLE)]
 
-    def measure(view: View) -> TileOffsets | None:
-        return measure_tile_offsets(found.image, view, caster, corners, mirrored=found.mirrored)
+    def measure_through(there: RayCaster) -> MeasureOffsets:
+        return lambda view: measure_tile_offsets(found.image, view, there, corners, mirrored=found.mirrored)
 
-    choice = select_camera(CubeObservations(*flat), rows, cols, square, sample, measure)
-    if choice.model is FRAME and square is not None and not choice.misfit_mm:
-        return _refine_square(square, choice, seen, rows, cols, sample, measure)
+    measure = measure_through(caster)
+    observed = CubeObservations(*seen.flat(), covariance=seen.covariance)
+    choice = select_camera(observed, by_corners, sample, measure)
     camera, alone = choice.fit.camera, choice.by_corners.camera
     if not len(sample):
-        return RefinedCamera(camera, alone.lateral_sd_mm(flat[0]), False, None, misfit_mm=choice.misfit_mm)
+        return RefinedCamera(camera, alone.lateral_sd_mm(seen.flat()[0]), False, None, misfit_mm=choice.misfit_mm)
     marker_sd_mm = alone.lateral_sd_mm(sample)
-    joint_sd_mm = float(np.hypot(camera.lateral_sd_mm(sample), JOINT_SD_MM)) if choice.specimen_used else None
+    joint_sd_mm = camera.lateral_sd_mm(sample) if choice.specimen_used else None
     shift = motion_of_tiles(last) if choice.moved and (last := measure(camera.view)) is not None else None
-    return RefinedCamera(
+    found_camera = RefinedCamera(
         camera, marker_sd_mm, choice.specimen_used, shift, joint_sd_mm, choice.ambiguity_mm, choice.misfit_mm
     )
-
-
-def _refine_square(
-    camera: CubeCamera,
-    choice: SelectedCamera,
-    seen: CornersInCube,
-    rows: int,
-    cols: int,
-    sample: Floats,
-    measure: Callable[[View], TileOffsets | None],
-) -> RefinedCamera:
-    """A frame camera of square pixels: by its markers, or with the specimen's middle where they leave it open."""
-    flat, markers = seen.flat(), len(seen.marker_ids)
-    if not len(sample):
-        return RefinedCamera(camera, camera.lateral_sd_mm(flat[0]), False, None)
-    centre, marker_sd_mm, specimen_used = sample.mean(0), camera.lateral_sd_mm(sample), False
-
-    def motion_through(camera: CubeCamera) -> Shift | None:
-        # However few the markers: it is the camera that is in question here.
-        known = choice.tile_offsets
-        there = known if known is not None and known.view is camera.view else measure(camera.view)
-        return None if there is None else motion_of_tiles(there)
-
-    shift = motion_through(camera)
-    for _ in range(ROUNDS):
-        if shift is None or shift.moved_mm > EXPLAINED_BY_CAMERA * np.hypot(marker_sd_mm, shift.sigma_mm):
-            break
-        across = np.array([*shift.shift_mm, 0.0])
-        pixel = camera.view.project((centre + across)[None])[0]
-        before, camera = (
-            camera,
-            solve_camera(*flat, rows, cols, anchor=Anchor(centre, pixel, shift.sigma_mm / camera.pixel_mm)),
-        )
-        specimen_used = True
-        shift = motion_through(camera)
-        if _apart_mm(before, camera, centre) < CONVERGED_MM:
-            break
-    if not specimen_used and markers < LEAST_MARKERS:
-        shift = None
-    misfit_mm = 0.0
-    if shift is not None and shift.significant and choice.specimen_used and not choice.moved:
-        # Tiles lie elsewhere, but not as those of something that moved as a whole.
-        misfit_mm, shift = shift.moved_mm, None
-    return RefinedCamera(
-        camera, marker_sd_mm, specimen_used, shift, model_sd_mm=choice.ambiguity_mm, misfit_mm=misfit_mm
-    )
-
-
-def _apart_mm(before: CubeCamera, after: CubeCamera, point: Floats) -> float:
-    """How far apart two cameras see a ``point`` (3,)."""
-    miss = before.view.project(point[None]) - after.view.project(point[None])
-    return float(np.linalg.norm(miss)) * after.pixel_mm
+    if not found_camera.moved:
+        return found_camera
+    followed = follow_motion(choice.fit, observed, measure_through, caster, corners, sample)
+    joint_sd_mm = followed.fit.specimen_sd_mm(sample)
+    return replace(found_camera, camera=followed.fit.camera, joint_sd_mm=joint_sd_mm, followed=followed)

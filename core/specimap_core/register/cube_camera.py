@@ -27,15 +27,6 @@ for less than this share of what their standard deviations state."""
 
 
 @dataclass(frozen=True)
-class Anchor:
-    """A point (3,) mm known to show at ``pixel`` (2,) of the cube, with ``sigma_px``."""
-
-    point: Floats
-    pixel: Floats
-    sigma_px: float
-
-
-@dataclass(frozen=True)
 class CubeCamera:
     """The solved camera: ``view``; RMS corner distance ``rms_px``; ``focal_sd``: one standard deviation of the
     logarithm of the focal length, as the corners determine it; ``covariance`` (n, n) of the ``model``'s parameters,
@@ -53,9 +44,8 @@ class CubeCamera:
         step = 1e-4
         J = np.stack(
             [
-                (apply_step(self.view, step * e).project(points) - apply_step(self.view, -step * e).project(points))
-                / (2 * step)
-                for e in np.eye(len(self.covariance))
+                (apply_step(self.view, e).project(points) - apply_step(self.view, -e).project(points)) / (2 * step)
+                for e in map(self.model.step, step * np.eye(len(self.covariance)))
             ],
             -1,
         )
@@ -88,11 +78,10 @@ def solve_camera(
     cols: int,
     *,
     focal_px: float | None = None,
-    anchor: Anchor | None = None,
 ) -> CubeCamera:
     """Solve the camera that sees ``corners`` (N, 3) mm at ``corners_px`` (N, 2); ``sigma_px`` (N,).
 
-    With ``focal_px`` the focal length is held, else it is an unknown. ``anchor``: one more point, not of a marker.
+    With ``focal_px`` the focal length is held, else it is an unknown.
 
     Raises:
         RegistrationError: no camera above the plane sees the corners there.
@@ -120,9 +109,9 @@ def solve_camera(
             advice="Check that cube and photos show the same, unmoved markers.",
         )
     lens = Intrinsics.centred(cols, rows, best[2])
-    first = _refine(corners, corners_px, sigma_px, lens, best[1], focal_px is None, anchor).view
+    first = _refine(corners, corners_px, sigma_px, lens, best[1], focal_px is None).view
     # Once more from there: steps and covariance are then about the camera that is given.
-    return _refine(corners, corners_px, sigma_px, first.intrinsics, first.cam_from_world, focal_px is None, anchor)
+    return _refine(corners, corners_px, sigma_px, first.intrinsics, first.cam_from_world, focal_px is None)
 
 
 def _refine(
@@ -132,7 +121,6 @@ def _refine(
     lens: Intrinsics,
     pose: Pose,
     free_focal: bool,
-    anchor: Anchor | None,
 ) -> CubeCamera:
     start = View(lens, pose)
     weight = 1 / np.maximum(sigma_px, 1e-3)[:, None]
@@ -147,8 +135,6 @@ def _refine(
         miss = (view.project(corners) - corners_px) * weight
         # The distance follows the focal length, which the prior keeps from running to infinity.
         rest = [(off + x[6]) / FOCAL_PRIOR_SD if free_focal else x[6] / 1e-3]
-        if anchor is not None:
-            rest += list((view.project(anchor.point[None])[0] - anchor.pixel) / anchor.sigma_px)
         return np.append(miss.ravel(), rest)
 
     answer = least_squares(residual, np.zeros(7), x_scale=np.array([1e-3] * 3 + [1.0] * 3 + [0.1]), loss="soft_l1")

@@ -8,7 +8,7 @@ another explains clearly more.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -88,24 +88,27 @@ class SelectedCamera:
         return len(self.fit.tile_miss) > 0
 
 
-def select_camera(
-    observed: CubeObservations,
-    rows: int,
-    cols: int,
-    square: CubeCamera | None,
-    places: Floats,
-    measure: MeasureOffsets,
-) -> SelectedCamera:
-    """Select among all kinds of camera for a cube of ``rows`` and ``cols``.
+def fit_by_corners(
+    observed: CubeObservations, rows: int, cols: int, square: CubeCamera | None
+) -> dict[Model, CameraFit]:
+    """Fit each kind of camera to the corners in a cube of ``rows`` and ``cols``.
 
-    ``square``: the frame camera of square pixels solved on the corners, if there is one; ``places`` (N, 3) mm of the
-    specimen's surface; ``measure``: measures the tiles' offsets through a camera.
+    ``square``: the frame camera of square pixels solved on the corners, if there is one.
 
     Raises:
         RegistrationError: no kind of camera sees the corners there.
     """
     starts = _starts(observed, rows, cols, square)
-    by_corners = {model: fitted for (model, _), fitted in _fits(starts, observed, (False,)).items()}
+    return {model: fitted for (model, _), fitted in _fits(starts, observed, (False,)).items()}
+
+
+def select_camera(
+    observed: CubeObservations, by_corners: Mapping[Model, CameraFit], places: Floats, measure: MeasureOffsets
+) -> SelectedCamera:
+    """Select among all kinds of camera fitted ``by_corners``.
+
+    ``places`` (N, 3) mm of the specimen's surface; ``measure``: measures the tiles' offsets through a camera.
+    """
     # Corners err together with the layout: what the best kind leaves of them is how far they can be trusted.
     observed = observed.with_inflated_corner_sigma(max(1.0, min(f.scatter for f in by_corners.values())))
     now = _fits({model: f.camera.view for model, f in by_corners.items()}, observed, (False,))
@@ -113,8 +116,6 @@ def select_camera(
     seen: TileOffsets | None = None
     for _ in range(ROUNDS):
         through = now[best].camera.view
-        if seen is None and best[0] is FRAME and square is not None:
-            through = square.view
         found = _first_offsets(
             measure, [through, *(f.camera.view for f in now.values())] if seen is None else [through]
         )
@@ -193,6 +194,22 @@ def _fit_all(
         closest = min(fits.values(), key=lambda f: f.cost)
         sigma_mm = max(LEAST_TILE_MM, SIGMA_OF_MAD * float(np.median(np.abs(closest.tile_miss))) * sigma_mm)
     return fits
+
+
+def fit_tiles(camera: CubeCamera, observed: CubeObservations, seen: TileOffsets, *, moved: bool) -> CameraFit | None:
+    """Fit a camera, of the model that it has, to corners and tiles as a camera is measured; None where none fits."""
+    sigma_mm, view = TILE_MM, camera.view
+    tiles = TileObservations.of(seen, sigma_mm)
+    if len(tiles.pixels) < LEAST_TILES:
+        return None
+    try:
+        for _ in range(2):
+            whole = replace(observed, tiles=TileObservations.of(seen, sigma_mm))
+            fitted = fit(view, camera.model, whole, motion=moved)
+            sigma_mm = max(LEAST_TILE_MM, SIGMA_OF_MAD * float(np.median(np.abs(fitted.tile_miss))) * sigma_mm)
+        return fit(view, camera.model, whole.with_inflated_tile_sigma(SHARED_TILE_ERROR), motion=moved)
+    except RegistrationError:
+        return None
 
 
 def _penalised(choice: tuple[Model, bool], fitted: CameraFit) -> float:

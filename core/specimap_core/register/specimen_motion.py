@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from specimap_core.arrays import Floats
 from specimap_core.geometry.cameras import View
 from specimap_core.geometry.robust import SIGMA_OF_MAD
+from specimap_core.register.camera_fitting import SHARED_MM
 from specimap_core.register.tile_matching import LEAST_TILES
 from specimap_core.register.tile_offsets import TileOffsets, measure_tile_offsets
 from specimap_core.surface.raycast import RayCaster
@@ -21,9 +22,6 @@ from specimap_core.surface.raycast import RayCaster
 LEAST_AGREE = 0.6
 LEAST_MARKERS = 4
 """Three nearly coplanar markers leave the cube's focal length open: raised tissue then seems to have moved."""
-SHARED_MM = 0.02
-"""Standard deviation of the error that all tiles share: seen through the true camera, specimens that did not move show
-0.00 to 0.01 mm on own phantoms and 0.02 to 0.03 mm on path-traced ones."""
 ALLOWED_MM = 0.3
 ALLOWED_SIGMA = 4.0
 

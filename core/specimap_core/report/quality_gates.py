@@ -20,7 +20,8 @@ LEAST_COVERAGE = 0.97
 """Of the cube's pixels between the markers."""
 USELESS_COVERAGE = 0.1
 USELESS_WITHOUT_SPECIMEN = 0.5
-"""Coverage below which a result without any point of a specimen is refused."""
+"""Coverage below which a result without any point of a specimen is refused, and one of photos that contradict each
+other."""
 MOST_CORNER_RMS_PX = 0.8
 OUTLYING_PX = 1.2
 """RMS of a photo's corners; with the following, whichever is more."""
@@ -132,9 +133,10 @@ def _check_cube(report: Report, edge_mm: float) -> None:
 
 def _check_useful(report: Report, warnings: list[Notice]) -> None:
     covered, specimen = report.coverage.between_markers, report.coverage.specimen_points
-    if covered >= USELESS_COVERAGE and (specimen or covered >= USELESS_WITHOUT_SPECIMEN):
-        return
     codes = {w.code for w in warnings}
+    whole = specimen and "corners_scatter" not in codes
+    if covered >= (USELESS_COVERAGE if whole else USELESS_WITHOUT_SPECIMEN):
+        return
     advice = "Take 20 or more sharp photos all around, in which the specimen with all markers fills the picture."
     if codes & {"corners_scatter", "photo_outlying"}:
         advice = "The photos contradict each other: something moved in between. Take all again, touching nothing."

@@ -73,11 +73,11 @@ def test_a_resized_image_and_a_moved_world_show_the_same(view: View) -> None:
 
 
 @pytest.mark.parametrize("axis", AXES)
-def test_the_ten_numbers_are_those_of_a_scan(axis: Axis) -> None:
+def test_the_first_ten_numbers_are_those_of_a_scan(axis: Axis) -> None:
     view = scan(axis)
-    steps = np.diag(PARAMETER_SCALES) * 1e-3
+    steps = (np.diag(PARAMETER_SCALES) * 1e-3)[list(SCANS[0].parameters)]
     J = np.stack([(apply_step(view, step).project(POINTS) - view.project(POINTS)).ravel() for step in steps], 1)
-    assert J.shape[1] == PARAMETERS
+    assert J.shape[1] == PARAMETERS - 1
     singular = np.linalg.svd(J / np.linalg.norm(J, axis=0), compute_uv=False)
     # None is another's, or nothing: places at several heights tell all of them apart.
     assert singular.min() > 1e-4
