@@ -55,8 +55,22 @@ class Adjusted:
     @property
     def sigma_corner_mm(self) -> Floats:
         """One standard deviation (Q, 4) of a corner's place in space, mm."""
-        variances = np.diag(self.covariance).reshape(len(self.marker_ids), 4, 3).sum(-1)
-        return np.asarray(np.sqrt(np.maximum(variances, 0)))
+        return _corner_sd(self.covariance)
+
+    def sigma_layout_mm(self, places: Floats) -> float:
+        """One standard deviation, mm, root mean square, of where the layout puts ``places`` (N, 3) mm between corners.
+
+        An error of scale moves a place by as much less as it is nearer to the middle; all else is taken to move it as
+        it moves a corner.
+        """
+        points = self.corners.reshape(-1, 3)
+        points = points - points.mean(0)
+        size = float(np.linalg.norm(points))
+        outward = points.ravel() / size
+        keep = np.eye(len(outward)) - np.outer(outward, outward)
+        scale_sd = float(np.sqrt(max(outward @ self.covariance @ outward, 0))) / size
+        away = float(np.sqrt(((places - self.corners.mean((0, 1))) ** 2).sum(1).mean())) if len(places) else 0.0
+        return float(np.hypot(np.median(_corner_sd(keep @ self.covariance @ keep)), scale_sd * away))
 
 
 def adjust(
@@ -132,6 +146,11 @@ def adjust(
         info.iterations,
         len(inner.photo),
     )
+
+
+def _corner_sd(covariance: Floats) -> Floats:
+    """Standard deviations (Q, 4) of corners of a covariance (12 Q, 12 Q)."""
+    return np.asarray(np.sqrt(np.maximum(np.diag(covariance).reshape(-1, 4, 3).sum(-1), 0)))
 
 
 def _scaled(pose: Pose, factor: float) -> Pose:

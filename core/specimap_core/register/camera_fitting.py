@@ -29,9 +29,9 @@ MOTION_SD = np.array([0.02, 0.02, 0.1, 3.0, 3.0, 0.2])
 """Standard deviations of a specimen's tilts and turn in rad and of its shift in mm: it is nudged or laid down anew on a
 tray, and what a cube hardly shows, a lift, is not made use of."""
 NO_MOTION = np.zeros(len(MOTION_SCALES))
-SHARED_MM = 0.02
+SHARED_MM = 0.02 / 2**0.5
 """Standard deviation, along an axis, of the error that all tiles share: seen through the true camera, specimens that
-did not move show 0.00 to 0.01 mm on own phantoms and 0.02 to 0.03 mm on path-traced ones."""
+did not move lie 0.00 to 0.01 mm away on own phantoms and 0.02 to 0.03 mm on path-traced ones."""
 SHARED = 2
 """Unknowns of that error."""
 

@@ -26,7 +26,7 @@ from specimap_core.register.motion_repair import FollowedMotion, follow_motion
 from specimap_core.register.specimen_motion import Shift, motion_of_tiles
 from specimap_core.register.tile_offsets import measure_tile_offsets
 from specimap_core.surface.raycast import RayCaster
-from specimap_core.surface.regions import raised_mm
+from specimap_core.surface.regions import raised_places
 
 LOOSE_MM = 0.1
 """Lateral standard deviation at the specimen from which on the camera is called loose."""
@@ -39,7 +39,6 @@ SQUARE = 0.005
 ROUNDS = 3
 CONVERGED_MM = 0.01
 """Rounds end when the specimen moves by less in the cube."""
-SAMPLE = 500
 
 
 @dataclass(frozen=True)
@@ -125,9 +124,7 @@ def refine_camera(
     ``by_corners``: cameras of every kind by the corners alone; ``found``: the markers with the image they show in;
     ``corners`` (Q, 4, 3) mm of all markers.
     """
-    vertices = caster.mesh.vertices
-    raised = vertices[vertices[:, 2] > raised_mm(corners)].astype(float)
-    sample = raised[:: max(1, len(raised) // SAMPLE)]
+    sample = raised_places(caster.mesh.vertices, corners)
 
     def measure_through(there: RayCaster) -> MeasureOffsets:
         return lambda view: measure_tile_offsets(found.image, view, there, corners, mirrored=found.mirrored)

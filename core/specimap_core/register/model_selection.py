@@ -38,7 +38,7 @@ MOTION_PENALTY = 20.0
 """Chi squared that a specimen that moved must gain over one that stayed."""
 TILE_MM, LEAST_TILE_MM = 0.1, 0.03
 """Standard deviation of a tile's place at first, and the least that is believed."""
-SHARED_TILE_ERROR = 3.0
+SHARED_TILE_ERROR = 2.0
 """Factor on a tile's standard deviation where it measures a camera, not where models are compared: several tiles share
 an error of the surface, which their scatter does not show."""
 LEAST_TILES = 5
@@ -129,7 +129,7 @@ def select_camera(
     model, moved = best
     taken = now[best]
     if taken.observed.tiles is not None:
-        taken = fit(taken.camera.view, model, taken.observed.with_inflated_tile_sigma(SHARED_TILE_ERROR), motion=moved)
+        taken = fit(taken.camera.view, model, taken.observed.with_inflated_tile_sigma(_shared(taken)), motion=moved)
     return SelectedCamera(model, taken, by_corners[model], moved, seen, _ambiguity_mm(now, best, places))
 
 
@@ -207,9 +207,15 @@ def fit_tiles(camera: CubeCamera, observed: CubeObservations, seen: TileOffsets,
             whole = replace(observed, tiles=TileObservations.of(seen, sigma_mm))
             fitted = fit(view, camera.model, whole, motion=moved)
             sigma_mm = max(LEAST_TILE_MM, SIGMA_OF_MAD * float(np.median(np.abs(fitted.tile_miss))) * sigma_mm)
-        return fit(view, camera.model, whole.with_inflated_tile_sigma(SHARED_TILE_ERROR), motion=moved)
+        return fit(view, camera.model, whole.with_inflated_tile_sigma(_shared(fitted)), motion=moved)
     except RegistrationError:
         return None
+
+
+def _shared(fitted: CameraFit) -> float:
+    """By how much more than stated a tile errs where it measures a camera."""
+    scatter = SIGMA_OF_MAD * float(np.median(np.abs(fitted.tile_miss)))
+    return max(1.0, SHARED_TILE_ERROR * scatter)
 
 
 def _penalised(choice: tuple[Model, bool], fitted: CameraFit) -> float:

@@ -31,6 +31,7 @@ from specimap_core.register.points import cloud_points
 from specimap_core.register.settings import Method, RegisterSettings
 from specimap_core.render.orthographic import Grid
 from specimap_core.surface.raycast import RayCaster
+from specimap_core.surface.regions import raised_places
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,7 @@ def register_cube(
         caster,
         surface.sigma_mm.astype(np.float32),
         adjusted.corners,
-        float(np.median(adjusted.sigma_corner_mm)),
+        adjusted.sigma_layout_mm(raised_places(caster.mesh.vertices, adjusted.corners)),
         refined.lateral_sd_mm,
         camera.pixel_mm,
         None if by_camera else parallax_mm,

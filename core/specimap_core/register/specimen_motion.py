@@ -111,5 +111,5 @@ def _rigid(
     # Two of three numbers are shared: what is left of 2 n values after three unknowns.
     per_axis = float(np.sqrt((residual**2).sum() / max(2 * len(residual) - 3, 1)))
     moved = float(np.sqrt((answer[:2] ** 2).sum() + answer[2] ** 2 * (centres[keep] ** 2).sum(1).mean()))
-    sigma = float(np.hypot(per_axis * np.sqrt(2 / len(residual)), SHARED_MM / px))
+    sigma = float(np.hypot(per_axis * np.sqrt(2 / len(residual)), 2**0.5 * SHARED_MM / px))
     return (float(answer[0]), float(answer[1])), float(answer[2]), moved, sigma, int(keep.sum())

@@ -19,6 +19,10 @@ SPECIMEN_HEIGHT_SHARE = 0.012
 """A specimen's points rise above the marker plane by more than this share of the layout's diagonal."""
 
 
+SAMPLE = 500
+"""Places that stand for a specimen's surface."""
+
+
 def on_card(xyz: NDArray[np.float32], corners: Floats) -> NDArray[np.bool_]:
     """Whether points (S, 3) lie on one of the cards, whose markers have corners (Q, 4, 3) mm."""
     found = np.zeros(len(xyz), bool)
@@ -42,6 +46,12 @@ def worth_refining(vertices: NDArray[np.float32], corners: Floats) -> NDArray[np
 def raised_mm(corners: Floats) -> float:
     """Height above the marker plane from which on something is the specimen."""
     return SPECIMEN_HEIGHT_SHARE * float(np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0)))
+
+
+def raised_places(vertices: NDArray[np.float32], corners: Floats) -> Floats:
+    """Some hundred of the vertices (V, 3) mm that rise as a specimen does, (N, 3) mm."""
+    raised = vertices[vertices[:, 2] > raised_mm(corners)].astype(float)
+    return raised[:: max(1, len(raised) // SAMPLE)]
 
 
 def on_specimen(
