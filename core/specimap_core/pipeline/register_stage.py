@@ -57,6 +57,7 @@ def register_stage(
                 surface,
                 settings.reconstruct.dictionary,
                 settings.register,
+                join=settings.adjust.form == "rigid",
                 progress=lambda share: progress(REGISTERED_SHARE * share),
             )
         except MarkersMissingInCubeError as error:

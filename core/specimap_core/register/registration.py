@@ -76,9 +76,10 @@ def register_cube(
     dictionary: str,
     settings: RegisterSettings,
     *,
+    join: bool = True,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Registered:
-    """Register a cube whose markers are of ``dictionary``.
+    """Register a cube whose markers are of ``dictionary``. With ``join`` its corners correct the layout of the photos.
 
     Raises:
         MarkersMissingInCubeError, DuplicateMarkersError: the cube's markers do not suffice.
@@ -88,6 +89,8 @@ def register_cube(
     markers = find_markers(cube, dictionary, surface.adjusted.marker_ids)
     progress(0.25)
     by_photos = corners_in_cube(markers, surface.adjusted, cube.cols)
+    if not join:
+        by_photos = replace(by_photos, covariance=None)
     homography = fit_homography(*by_photos.flat()[:2], surface.coarse, settings.ransac_px)
     joint = join_cube(by_photos, surface.adjusted, cube.rows, cube.cols)
     by_camera = settings.method == "camera"

@@ -140,3 +140,10 @@ def test_two_markers_leave_the_layout_of_the_photos() -> None:
     assert j.joint.adjusted is j.photos
     assert j.joint.scale == 1.0
     assert j.joint.by_corners
+
+
+def test_corners_without_covariance_leave_the_layout_of_the_photos() -> None:
+    photos, seen = many()[0].photos, many()[0].joint.seen
+    alone = join_cube(replace(seen, covariance=None), photos, ROWS, COLS)
+    assert alone.adjusted is photos
+    assert alone.scale == 1.0
