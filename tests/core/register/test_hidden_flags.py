@@ -62,7 +62,7 @@ def runs(tilt_deg: float, folders: dict[int, Path]) -> dict[Method, list[Hidden]
 
 
 def settings(seed: int, tilt_deg: float) -> PhantomSettings:
-    return PhantomSettings(seed=seed, hsi_tilt_deg=tilt_deg, photos=16, cube_rows=320, cube_cols=400, bands=4)
+    return PhantomSettings(seed=seed, hsi_tilt_deg=tilt_deg, bands=4)
 
 
 @pytest.fixture(scope="module")
