@@ -62,7 +62,7 @@ class RefinedCamera:
 
     @property
     def moved(self) -> bool:
-        """Whether the specimen lies elsewhere in the cube than in the photos."""
+        """Whether the specimen lies elsewhere in the cube than in the photos, by so much that a warning is due."""
         shift = self.shift
         return shift is not None and shift.significant and shift.moved_mm > MOTION_OVER_MISFIT * self.misfit_mm
 
@@ -141,7 +141,8 @@ def refine_camera(
     found_camera = RefinedCamera(
         camera, marker_sd_mm, choice.specimen_used, shift, joint_sd_mm, choice.ambiguity_mm, choice.misfit_mm
     )
-    if not found_camera.moved:
+    # Also where it moved by less than calls for a warning: the camera was fitted as if it had.
+    if shift is None or shift.moved_mm <= MOTION_OVER_MISFIT * choice.misfit_mm:
         return found_camera
     followed = follow_motion(choice.fit, observed, measure_through, caster, corners, sample)
     joint_sd_mm = followed.fit.specimen_sd_mm(sample)

@@ -212,6 +212,16 @@ def test_a_run_states_that_the_specimen_moved_and_follows_it(finished: Finished,
     assert judged.within(2) > 0.88
 
 
+@pytest.mark.slow
+def test_a_motion_too_small_for_a_warning_is_followed_too(finished: Finished, small: OnDisk, tmp_path: Path) -> None:
+    usual, moved_mm = judge(finished.out, small.folder), (0.2, -0.15, 0.0)
+    report = rerun(finished, small, tmp_path, replace(LARGER, moved_mm=moved_mm), ())
+    assert "specimen_moved" not in codes(report)
+    judged = judge_with_sigma(tmp_path / "out", tmp_path)
+    assert 0.5 * usual.median < judged.errors.median < 0.6 * float(np.hypot(*moved_mm[:2]))
+    assert judged.within(1) > 0.5
+
+
 @pytest.fixture(scope="module")
 def blurred(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Report]:
     """A run on photos so blurred that one marker is read in none of them."""
