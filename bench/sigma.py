@@ -28,8 +28,8 @@ from specimap_core.surface.uncertainty import (
     Shares,
     bend_mm,
     point_sigma,
+    refined_scatter,
     step_height,
-    vertex_scatter,
 )
 from specimap_validation.phantom import PhantomSettings, load_truth, write_phantom
 
@@ -168,7 +168,7 @@ def specimen(folder: Path, scratch: Path) -> Specimen:
     scene = Scene(folder, load_truth(folder), stage1, stage2, settings)
     placed, at, errors = scene.placed(scene.caster, scene.camera)
     return Specimen(
-        Evidence.of(refined, vertex_scatter(refined.mesh, maps, adjusted.poses, workers=workers)),
+        Evidence.of(refined, refined_scatter(refined, maps, adjusted.poses, workers=workers)),
         scene.caster,
         placed.triangle[at],
         placed.barycentric[at],

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import coo_array
 
 from specimap_core.arrays import Floats
 from specimap_core.errors import DepthNotFoundError
@@ -126,14 +126,6 @@ def _largest_parts(
     used[kept] = True
     new_index = np.cumsum(used) - 1
     return vertices[used], new_index[kept].astype(np.int32), colours[used]
-
-
-def edges_between(triangles: NDArray[np.int32], n: int) -> csr_array:
-    """Which of ``n`` vertices share an edge, (n, n), 1 where they do."""
-    a, b = triangles[:, [0, 1, 2]].ravel(), triangles[:, [1, 2, 0]].ravel()
-    edges = coo_array((np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, a])), shape=(n, n)).tocsr()
-    edges.data[:] = 1.0
-    return edges
 
 
 def vertex_normals(vertices: NDArray[np.float32], triangles: NDArray[np.int32]) -> NDArray[np.float32]:

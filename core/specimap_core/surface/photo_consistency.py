@@ -1,4 +1,4 @@
-"""Photo-consistency of a surface: the photos compared at each vertex, and how alike its patches are in them."""
+"""Photo-consistency of a surface: which photos are compared at each vertex, and how well they agree there."""
 
 from __future__ import annotations
 
@@ -8,20 +8,21 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
-from specimap_core.arrays import Floats, Ints, Singles
+from specimap_core.arrays import Bytes, Floats, Ints, Singles
 from specimap_core.geometry.cameras import Intrinsics, Pose
 from specimap_core.geometry.image_sampling import sample
 from specimap_core.surface.fusion import Mesh
 from specimap_core.surface.raycast import RayCaster
 
 CHUNK = 8192
-"""Vertices whose views are chosen at a time."""
-NOISE_VARIANCE = 4.0
-"""Variance in grey levels that a patch is given on top of its own, so that plain areas do not count as agreeing."""
-PATCH_SIGMA = 0.75
-"""Standard deviation of a patch's weights as a share of its half width: its middle is where the vertex is."""
+"""Vertices at a time."""
+NOISE_VARIANCE = 2.0
+"""Variance, in 255ths of the brightest light, that contrast is given on top of its own: plain areas have none."""
+OWN_VARIANCE = 0.05
+"""The same of the contrast that the photos show at a vertex, of which 1 is usual."""
+OBLIQUE = 1.5
+"""A photo counts by this power of the cosine at which it sees a vertex."""
 IMAGE_MARGIN_PX = 6
 SPARE_BEFORE_HIDDEN = 3
 """Candidates beyond those wanted, since some will be hidden."""
@@ -32,15 +33,61 @@ HIGHLIGHT = 1.04
 LEAST_WITHOUT_HIGHLIGHTS = 4
 """So many of the darkest views are kept, whatever the others show."""
 BRIGHTNESS_SIGMA_PX = 1.5
+LINEAR = 255 * np.where(np.arange(256) <= 10, np.arange(256) / 3294.6, ((np.arange(256) + 14.025) / 269.025) ** 2.4)
+"""Light, 0 to 255, of each sRGB value (IEC 61966-2-1)."""
 
 
 @dataclass(frozen=True)
 class Photographs:
-    """Grey photos (H, W) float32 of one lens with their ``cam_from_world``, in one order."""
+    """Grey photos (H, W) uint8 sRGB of one lens with their ``cam_from_world``, in one order."""
 
-    greys: list[Singles]
+    greys: list[Bytes]
     lens: Intrinsics
     poses: tuple[Pose, ...]
+
+
+@dataclass(frozen=True)
+class Contrasts:
+    """The local contrast of all photos: what each pixel's light differs from its surroundings, over how much they vary.
+
+    Gain and offset of a photo, shading and what a wet surface mirrors of a room are gone from it, and what is left is
+    compared pixel by pixel. ``sheet``: the photos (H, W) float32 side by side, ``columns`` in a row.
+    """
+
+    photographs: Photographs
+    sheet: Singles
+    columns: int
+
+    @staticmethod
+    def of(photographs: Photographs, surroundings_px: float, blur_px: float, *, workers: int = 1) -> Contrasts:
+        """Of photos blurred by ``blur_px``; the surroundings are a Gaussian of ``surroundings_px``."""
+        height, width = photographs.greys[0].shape
+        columns = int(np.ceil(np.sqrt(len(photographs.greys))))
+        rows = -(-len(photographs.greys) // columns)
+        sheet = np.zeros((rows * height, columns * width), np.float32)
+        linear = LINEAR.astype(np.float32)
+
+        def put(k: int) -> None:
+            light = cv2.LUT(photographs.greys[k], linear)
+            if blur_px > 0:
+                light = cv2.GaussianBlur(light, (0, 0), blur_px)
+            light -= cv2.GaussianBlur(light, (0, 0), surroundings_px)
+            light /= np.sqrt(cv2.GaussianBlur(light * light, (0, 0), surroundings_px) + np.float32(NOISE_VARIANCE))
+            row, column = divmod(k, columns)
+            sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = light
+
+        with ThreadPoolExecutor(workers) as pool:
+            list(pool.map(put, range(len(photographs.greys))))
+        return Contrasts(photographs, sheet, columns)
+
+    def at(self, photo: Ints, pixels: Singles) -> Singles:
+        """Contrast (k, n) at ``pixels`` (k, n, 2) of the photos (k, n)."""
+        height, width = self.photographs.greys[0].shape
+        row, column = np.divmod(photo, self.columns)
+        # Beside a photo lies another one.
+        x = np.clip(pixels[..., 0], 0, width - 1) + (column * width).astype(np.float32)
+        y = np.clip(pixels[..., 1], 0, height - 1) + (row * height).astype(np.float32)
+        return sample(self.sheet, x, y)
 
 
 def choose_views(
@@ -123,66 +170,41 @@ def _median_of_known(values: Singles) -> Singles:
     return np.where(count > 0, middle, 0).astype(np.float32)
 
 
-def patch_scores(
-    points: Floats,
-    normals: Floats,
-    views: Ints,
-    photographs: Photographs,
-    offsets: Floats,
-    sample_mm: float,
-    half: int,
-) -> Singles:
-    """Mean pairwise correlation (m, steps) of what the ``views`` (m, k) show of patches at points (m, 3), moved along
-    their normals by the ``offsets`` (steps,) mm.
+def agreement(
+    points: Floats, directions: Floats, views: Ints, contrasts: Contrasts, offsets: Floats
+) -> tuple[Singles, Singles]:
+    """What the ``views`` (n, k) show at points (n, 3) moved along unit ``directions`` (n, 3) by the ``offsets``
+    (steps,) mm: the mean product of two photos' contrasts, and the mean square of one, both (n, steps).
 
-    A patch lies in the surface's tangent plane, (2 half + 1)^2 samples ``sample_mm`` apart, weighted by a Gaussian.
+    Averaged over the surroundings, the first over the second is the correlation between photos. They are weighted by
+    how squarely they see a point.
     """
+    photographs = contrasts.photographs
     lens, poses = photographs.lens, photographs.poses
-    # One entry for each photo of each patch, those of one photo together.
-    row, column = np.nonzero(views >= 0)
-    order = np.argsort(views[row, column], kind="stable")
-    row, view = row[order], views[row, column][order]
-    count = np.bincount(row, minlength=len(points))
-    sum_of_row = csr_array((np.ones(len(row), np.float32), (row, np.arange(len(row)))), shape=(len(points), len(row)))
-    first = np.searchsorted(view, np.arange(len(poses) + 1))
-    R = np.stack([p.R for p in poses])[view]
-    helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
-    tangent = np.cross(helper, normals)
-    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
-
-    def seen(vectors: Floats) -> Floats:
-        return np.asarray(np.einsum("eij,ej->ei", R, vectors[row]))
-
-    # Over a millimetre the projection is linear to a thousandth of a pixel: its derivatives serve all samples.
-    cam = seen(points) + np.stack([p.t for p in poses])[view]
-    small = 0.05
+    # Photos first: sums over them are then of whole rows.
+    photo = np.ascontiguousarray(np.maximum(views, 0).T)
+    R, t = np.stack([p.R for p in poses]), np.stack([p.t for p in poses])
+    towards = np.stack([p.centre for p in poses])[photo] - points
+    length = np.maximum(np.linalg.norm(towards, axis=2), 1e-9)
+    cosine = np.einsum("kni,ni->kn", towards, directions) / length
+    weight = np.where(views.T >= 0, np.clip(cosine, 0.02, 1) ** OBLIQUE, 0).astype(np.float32)
+    # Over a millimetre the projection is linear to a hundredth of a pixel.
+    turns = R[photo]
+    cam = np.einsum("knij,nj->kni", turns, points) + t[photo]
+    # Where no photo is compared, any place before the camera will do.
+    cam[views.T < 0] = (0.0, 0.0, 1.0)
     base = lens.project(cam)
-    by_normal, by_tangent, by_other = (
-        (lens.project(cam + small * step) - lens.project(cam - small * step)) / (2 * small)
-        for step in map(seen, (normals, tangent, np.cross(normals, tangent)))
+    small = offsets[-1] / 2
+    step = ((lens.project(cam + small * np.einsum("knij,nj->kni", turns, directions)) - base) / small).astype(
+        np.float32
     )
-    side = np.arange(-half, half + 1, dtype=np.float32)
-    across, along = (g.ravel() for g in np.meshgrid(side, side))
-    weight = np.exp(-(across**2 + along**2) / (2 * (PATCH_SIGMA * half) ** 2))
-    weight /= weight.sum()
-    root = np.sqrt(weight)
-    patch_x, patch_y = (
-        (sample_mm * (np.outer(by_tangent[:, c], across) + np.outer(by_other[:, c], along))).astype(np.float32)
-        for c in (0, 1)
-    )
-    out = np.empty((len(points), len(offsets)), np.float32)
-    values = np.empty_like(patch_x)
+    base = base.astype(np.float32)
+    total, squares = weight.sum(0), (weight * weight).sum(0)
+    pairs, singles = np.maximum(total * total - squares, 1e-4), np.maximum(total, 1e-3)
+    product, square = (np.empty((len(points), len(offsets)), np.float32) for _ in range(2))
     for k, offset in enumerate(offsets):
-        at = (base + offset * by_normal).astype(np.float32)
-        x, y = at[:, :1] + patch_x, at[:, 1:] + patch_y
-        for v in range(len(poses)):
-            of = slice(first[v], first[v + 1])
-            if of.stop > of.start:
-                values[of] = sample(photographs.greys[v], x[of], y[of])
-        centred = (values - (values @ weight)[:, None]) * root
-        square = np.einsum("es,es->e", centred, centred)
-        centred /= np.sqrt(square + NOISE_VARIANCE / 4)[:, None]
-        together = sum_of_row @ centred
-        own = sum_of_row @ (square / (square + NOISE_VARIANCE / 4))
-        out[:, k] = (np.einsum("ms,ms->m", together, together) - own) / np.maximum(count * (count - 1), 1)
-    return out
+        seen = contrasts.at(photo, base + np.float32(offset) * step)
+        weighted = seen * weight
+        product[:, k] = (weighted.sum(0) ** 2 - (weighted * weighted).sum(0)) / pairs
+        square[:, k] = (weighted * seen).sum(0) / singles
+    return product, square

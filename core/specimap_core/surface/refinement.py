@@ -1,29 +1,51 @@
 """Move a mesh to where the photos agree: each vertex along its normal, by photo-consistency among many views.
 
-Pairwise depth is fused at the resolution of its matching windows and leans inward on bumps. Here, patches lying in
-the surface's own tangent plane are compared among up to nine photos at once (mean pairwise normalised
-cross-correlation, as in multi-view stereo since Goesele et al. 2007) for a few offsets along the normal; the best
-offset, to a fraction of the step, is smoothed over neighbours by how sharply it is determined. Further, shorter
-passes start from the normals that those before have put right.
+Pairwise depth is fused at the resolution of its matching windows and leans inward on bumps. Here, up to sixteen photos
+at once are compared at every vertex for a few offsets along the normal, by their local contrast, which gain, shading
+and reflections of a room leave alone. Products of contrasts, averaged over the surroundings, make a normalised
+cross-correlation whose window follows the surface (as patches do in multi-view stereo since Goesele et al. 2007, which
+are flat). The best offset, to a fraction of the step, is smoothed by how sharply it is determined. Later passes reach
+less far, on a mesh with edges half as long.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
-from specimap_core.arrays import Floats
+from specimap_core.arrays import Floats, Ints, Singles
 from specimap_core.geometry.cameras import Intrinsics, Pose
 from specimap_core.progress import within
-from specimap_core.surface.fusion import Mesh, edges_between, vertex_normals
-from specimap_core.surface.photo_consistency import Photographs, choose_views, patch_scores
+from specimap_core.surface.fusion import Mesh, vertex_normals
+from specimap_core.surface.mesh_graph import (
+    averaged,
+    edges_between,
+    open_vertices,
+    smoothed,
+    subdivided,
+    unit_averaged,
+)
+from specimap_core.surface.photo_consistency import (
+    CHUNK,
+    OWN_VARIANCE,
+    Contrasts,
+    Photographs,
+    agreement,
+    choose_views,
+)
 from specimap_core.surface.settings import Pass, RefineSettings
 
-CHUNK = 2048
+LEAST_VIEWS = 3
+CHANCE = 1.2
+"""Photos that have nothing in common hardly reach a correlation of so many standard deviations of one pixel's, which
+for k photos is the root of 2 / (k (k - 1)): a window holds some pixels, but the best of some offsets is taken."""
+MOST_WEIGHT = 5.0
+"""Of a vertex, over the median: beyond, sharpness is chance."""
 
 
 @dataclass(frozen=True)
@@ -31,15 +53,17 @@ class Refined:
     """A refined mesh, and how it came about.
 
     ``views`` (V,): photos that were compared at a vertex, 0 where none were. ``sharpness`` (V,), 1/mm^2: how fast
-    their mean correlation falls off along the normal, its curvature times its height; 0 where it has no top within
-    reach, NaN where the vertex was not refined. ``found`` (V,): whether enough photos agreed on the vertex's place; the
-    others follow their neighbours.
+    their correlation falls off along the normal, its curvature times its height; 0 where it has no top within reach,
+    NaN where the vertex was not refined. ``found`` (V,): whether enough photos agreed on the vertex's place; the
+    others follow their neighbours. ``parents`` (V, 2): the vertices of the mesh before that a vertex lies between,
+    twice the same where it was one of them.
     """
 
     mesh: Mesh
     views: NDArray[np.uint8]
     sharpness: NDArray[np.float32]
     found: NDArray[np.bool_]
+    parents: Ints
 
 
 def pixel_footprint_mm(lens: Intrinsics, poses: tuple[Pose, ...], target: Floats) -> float:
@@ -59,84 +83,152 @@ def refine_mesh(
     worth: NDArray[np.bool_] | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Refined:
-    """The mesh with its vertices moved along their normals; ``images`` (H, W) grey, in the order of ``poses``.
+    """The mesh with its vertices moved along their normals, and new ones between them; ``images`` (H, W) grey, in the
+    order of ``poses``.
 
-    ``worth`` (V,): the vertices that are worth the time, all by default; the others keep their places.
+    ``worth`` (V,): the vertices that are worth the time, all by default; the others keep their places. The first V
+    vertices of the result are those of the mesh.
     """
-    chosen = np.arange(len(mesh.vertices)) if worth is None else np.flatnonzero(worth)
-    photographs = Photographs([image.astype(np.float32) for image in images], lens, poses)
-    cost = [p.steps * p.views for p in settings.passes]
     count = len(mesh.vertices)
+    chosen = np.arange(count) if worth is None else np.flatnonzero(worth)
+    itself = np.arange(count)
     unknown = np.full(count, np.nan, np.float32)
-    refined = Refined(mesh, np.zeros(count, np.uint8), unknown, np.zeros(count, bool))
-    views: NDArray[np.int64] | None = None
-    for k, one in enumerate(settings.passes if len(chosen) else ()):
+    untouched = Refined(mesh, np.zeros(count, np.uint8), unknown, np.zeros(count, bool), np.stack([itself, itself], 1))
+    if not len(chosen):
+        progress(1.0)
+        return untouched
+    photographs = Photographs(images, lens, poses)
+    pixel_mm = pixel_footprint_mm(lens, poses, mesh.vertices[chosen].mean(0).astype(float))
+    refined = replace(untouched, mesh=_calmed(mesh, chosen, settings.start_rounds))
+    # Halving the edges makes four vertices of one.
+    cost = [
+        p.steps * (4 if any(q.finer for q in settings.passes[: k + 1]) else 1) for k, p in enumerate(settings.passes)
+    ]
+    contrasts: dict[tuple[float, float], Contrasts] = {}
+    views: Ints | None = None
+    for k, one in enumerate(settings.passes):
         done, share = sum(cost[:k]) / sum(cost), cost[k] / sum(cost)
-        if views is None or not one.keep_views:
-            views = choose_views(refined.mesh, chosen, photographs, one.views, settings.least_cosine, workers=workers)
+        if views is None or one.choose_views:
+            views = choose_views(
+                refined.mesh, chosen, photographs, settings.views, settings.least_cosine, workers=workers
+            )
+        if one.finer:
+            refined, chosen, views = _finer(refined, chosen, views)
+        kind = (one.surroundings_voxels, one.blur_voxels)
+        if kind not in contrasts:
+            voxel_px = voxel_mm / pixel_mm
+            contrasts = {kind: Contrasts.of(photographs, kind[0] * voxel_px, kind[1] * voxel_px, workers=workers)}
         progress(done + 0.2 * share)
         refined = _refined_once(
             refined,
             chosen,
             views,
-            photographs,
-            voxel_mm,
-            settings,
+            contrasts[kind],
+            one.reach_voxels * voxel_mm,
             one,
+            settings,
             workers,
             within(progress, done + 0.2 * share, done + share),
         )
     progress(1.0)
-    return refined
+    # What photos do not confirm anywhere stays as it was.
+    return refined if refined.found.any() else untouched
 
 
 def _refined_once(
     start: Refined,
-    chosen: NDArray[np.int64],
-    views: NDArray[np.int64],
-    photographs: Photographs,
-    voxel_mm: float,
-    settings: RefineSettings,
+    chosen: Ints,
+    views: Ints,
+    contrasts: Contrasts,
+    reach_mm: float,
     one: Pass,
+    settings: RefineSettings,
     workers: int,
     progress: Callable[[float], None],
 ) -> Refined:
     """One pass over the ``chosen`` (n,) vertices, by the photos in ``views`` (n, k)."""
     mesh = start.mesh
-    points, normals = mesh.vertices[chosen].astype(float), mesh.normals[chosen].astype(float)
-    reach = one.reach_voxels * voxel_mm
-    offsets = np.linspace(-reach, reach, one.steps)
-    sample_mm = pixel_footprint_mm(photographs.lens, photographs.poses, points.mean(0))
-    scores = np.zeros((len(points), one.steps), np.float32)
+    edges = _edges_among(mesh, chosen)
+    points = mesh.vertices[chosen].astype(float)
+    directions = unit_averaged(mesh.normals[chosen].astype(float), edges, settings.direction_rounds)
+    offsets = np.linspace(-reach_mm, reach_mm, one.steps)
+    product, square = (np.empty((len(points), one.steps), np.float32) for _ in range(2))
 
     def run(part: slice) -> None:
-        scores[part] = patch_scores(
-            points[part], normals[part], views[part], photographs, offsets, sample_mm, one.half_samples
-        )
+        product[part], square[part] = agreement(points[part], directions[part], views[part], contrasts, offsets)
 
     parts = [slice(k, k + CHUNK) for k in range(0, len(points), CHUNK)]
     with ThreadPoolExecutor(workers) as pool:
         for done, _ in enumerate(pool.map(run, parts), 1):
-            progress(0.9 * done / len(parts))
+            progress(0.8 * done / len(parts))
+    both = averaged(np.hstack([product, square]), edges, one.rounds)
+    scores = both[:, : one.steps] / (both[:, one.steps :] + np.float32(OWN_VARIANCE))
     best, sharp = _best_offsets(scores, offsets)
-    sure = ((views >= 0).sum(1) >= 3) & (scores.max(1) > settings.least_score)
+    compared = (views >= 0).sum(1)
+    by_chance = CHANCE * np.sqrt(2 / np.maximum(compared * (compared - 1), 1))
+    sure = (compared >= LEAST_VIEWS) & (scores.max(1) > np.maximum(settings.least_score, by_chance))
     weight = np.where(sure, sharp, 0.0)
     if not (weight > 0).any():
         return start
-    weight = np.minimum(weight / np.median(weight[weight > 0]), 5.0)
-    offset, trust = np.zeros(len(mesh.vertices)), np.zeros(len(mesh.vertices))
-    offset[chosen], trust[chosen] = best, weight
-    moved = np.zeros(len(mesh.vertices))
-    moved[chosen] = _smoothed(offset, trust, mesh.triangles, settings)[chosen]
-    vertices = (mesh.vertices + moved[:, None] * mesh.normals).astype(np.float32)
-    compared, sharpness, found = start.views.copy(), start.sharpness.copy(), start.found.copy()
-    compared[chosen], found[chosen] = (views >= 0).sum(1), sure
+    weight = np.minimum(weight / np.median(weight[weight > 0]), MOST_WEIGHT)
+    moved = smoothed(best, weight, edges, settings.slope, settings.bend)
+    vertices = mesh.vertices.copy()
+    vertices[chosen] = points + moved[:, None] * directions
+    counts, sharpness, found = start.views.copy(), start.sharpness.copy(), start.found.copy()
+    counts[chosen], found[chosen] = compared, sure
     sharpness[chosen] = sharp / (offsets[1] - offsets[0]) ** 2
-    after = Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), mesh.colours)
-    return Refined(after, compared, sharpness, found)
+    return replace(start, mesh=_placed(mesh, vertices), views=counts, sharpness=sharpness, found=found)
 
 
-def _best_offsets(scores: NDArray[np.float32], offsets: Floats) -> tuple[Floats, Floats]:
+def _edges_among(mesh: Mesh, chosen: Ints) -> csr_array:
+    number = np.full(len(mesh.vertices), -1, np.int32)
+    number[chosen] = np.arange(len(chosen), dtype=np.int32)
+    triangles = number[mesh.triangles]
+    return edges_between(triangles[(triangles >= 0).all(1)], len(chosen))
+
+
+def _placed(mesh: Mesh, vertices: NDArray[np.float32]) -> Mesh:
+    return Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), mesh.colours)
+
+
+def _calmed(mesh: Mesh, chosen: Ints, rounds: int) -> Mesh:
+    """The mesh with its noise smoothed away, but for borders, which would draw back."""
+    edges = edges_between(mesh.triangles, len(mesh.vertices))
+    degree = np.maximum(np.asarray(edges.sum(1)).ravel(), 1)[:, None]
+    still = np.ones(len(mesh.vertices), bool)
+    still[chosen] = False
+    still |= open_vertices(mesh.triangles, len(mesh.vertices))
+    vertices = mesh.vertices.astype(float)
+    for _ in range(rounds):
+        middle = (edges @ vertices) / degree
+        vertices = np.where(still[:, None], vertices, (vertices + middle) / 2)
+    return _placed(mesh, vertices.astype(np.float32))
+
+
+def _finer(refined: Refined, chosen: Ints, views: Ints) -> tuple[Refined, Ints, Ints]:
+    """With the edges between ``chosen`` vertices halved; a new vertex is compared in the photos of one beside it."""
+    mesh = refined.mesh
+    finer = np.zeros(len(mesh.vertices), bool)
+    finer[chosen] = True
+    triangles, between = subdivided(mesh.triangles, finer)
+    a, b = between.T
+    vertices = np.concatenate([mesh.vertices, (mesh.vertices[a] + mesh.vertices[b]) / 2])
+    colours = np.concatenate([mesh.colours, ((mesh.colours[a].astype(np.uint16) + mesh.colours[b]) // 2)])
+    number = np.zeros(len(mesh.vertices), np.int64)
+    number[chosen] = np.arange(len(chosen))
+    after = Mesh(vertices, triangles, vertex_normals(vertices, triangles), colours.astype(np.uint8))
+    with_new = Refined(
+        after,
+        np.concatenate([refined.views, refined.views[a]]),
+        np.concatenate([refined.sharpness, (refined.sharpness[a] + refined.sharpness[b]) / 2]),
+        np.concatenate([refined.found, refined.found[a] & refined.found[b]]),
+        np.concatenate([refined.parents, between]),
+    )
+    added = np.arange(len(mesh.vertices), len(vertices))
+    return with_new, np.concatenate([chosen, added]), np.concatenate([views, views[number[a]]])
+
+
+def _best_offsets(scores: Singles, offsets: Floats) -> tuple[Floats, Floats]:
     """Offset of the parabola's top (V,) and how sharp it is (V,); 0 sharp where the top is at the end."""
     step = offsets[1] - offsets[0]
     top = scores.argmax(1)
@@ -148,14 +240,3 @@ def _best_offsets(scores: NDArray[np.float32], offsets: Floats) -> tuple[Floats,
     shift = np.clip(np.where(curved, 0.5 * (left - right) / np.where(curved, bend, -1.0), 0.0), -1, 1)
     inner = curved & (top > 0) & (top < len(offsets) - 1)
     return offsets[middle] + shift * step, np.where(inner, -bend * np.maximum(centre, 0), 0.0)
-
-
-def _smoothed(best: Floats, weight: Floats, triangles: NDArray[np.int32], settings: RefineSettings) -> Floats:
-    """Offsets (V,) that follow ``best`` by ``weight`` and their neighbours for the rest (Jacobi rounds)."""
-    edges = edges_between(triangles, len(best))
-    degree = np.asarray(edges.sum(1)).ravel()
-    out = np.where(weight > 0, best, 0.0)
-    for _ in range(settings.smoothing_rounds):
-        pull = settings.smoothness * (edges @ out)
-        out = (weight * best + pull) / (weight + settings.smoothness * degree + 1e-12)
-    return np.asarray(out)

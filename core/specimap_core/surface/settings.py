@@ -23,28 +23,41 @@ class SurfaceSettings:
 
 @dataclass(frozen=True)
 class Pass:
-    """One round: the farthest offset ``reach_voxels``, how many ``steps`` are tried, ``views`` compared;
-    ``half_samples``: the patch is (2 n + 1)^2 samples, a photo's pixel apart on the surface; ``keep_views``: compare
-    the photos of the round before, which choosing anew would hardly change."""
+    """One round: the farthest offset ``reach_voxels`` and how many ``steps`` are tried; ``rounds`` of averaging over
+    neighbours, which make the window that is compared; ``surroundings_voxels`` and ``blur_voxels``: the Gaussians of
+    the photos' local contrast and of what they are blurred by; ``finer``: the edges are halved first; ``choose_views``:
+    photos are chosen anew."""
 
     reach_voxels: float
     steps: int
-    views: int
-    half_samples: int = 2
-    keep_views: bool = False
+    rounds: int
+    surroundings_voxels: float
+    blur_voxels: float = 0.0
+    finer: bool = False
+    choose_views: bool = False
 
 
 @dataclass(frozen=True)
 class RefineSettings:
     """Photo-consistent refinement.
 
-    ``passes``: the rounds; the last, on smaller patches, brings out what is narrower than the others'.
-    ``least_score``: correlation below which a vertex follows its neighbours. ``smoothness``: weight of the
-    neighbours.
+    ``passes``: the rounds, in which up to ``views`` photos are compared that see a place at more than
+    ``least_cosine``. ``least_score``: correlation below which a vertex follows its neighbours. ``slope`` and ``bend``:
+    weights of neighbours that are moved by as much, and by what lies in their middle. ``start_rounds``: rounds of
+    smoothing before all else, since neighbours that stand apart by noise are not at their best at one offset;
+    ``direction_rounds``: of the directions along which vertices move, for the same reason.
     """
 
-    passes: tuple[Pass, ...] = (Pass(2.0, 11, 9), Pass(0.8, 5, 9), Pass(0.5, 5, 9, half_samples=1, keep_views=True))
-    least_score: float = 0.3
-    smoothness: float = 0.2
-    smoothing_rounds: int = 10
-    least_cosine: float = 0.25
+    passes: tuple[Pass, ...] = (
+        Pass(2.0, 11, 4, 1.7, blur_voxels=0.25, choose_views=True),
+        Pass(1.5, 9, 3, 1.7, blur_voxels=0.25),
+        Pass(1.2, 9, 6, 0.65, finer=True, choose_views=True),
+        Pass(0.5, 5, 4, 0.65),
+    )
+    views: int = 16
+    least_cosine: float = 0.3
+    least_score: float = 0.15
+    slope: float = 0.1
+    bend: float = 20.0
+    start_rounds: int = 4
+    direction_rounds: int = 4

@@ -11,7 +11,7 @@ within two; docs/accuracy.md has what came of it on others.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -21,7 +21,8 @@ from specimap_core.arrays import Floats
 from specimap_core.geometry.cameras import Pose
 from specimap_core.geometry.depth_map import DepthMap
 from specimap_core.geometry.robust import SIGMA_OF_MAD
-from specimap_core.surface.fusion import Mesh, edges_between
+from specimap_core.surface.fusion import Mesh
+from specimap_core.surface.mesh_graph import edges_between
 from specimap_core.surface.refinement import Refined
 
 AGREEMENT_MM = 1.5
@@ -33,11 +34,11 @@ LEAST_SIGMA_MM = 0.01
 LEAST_COSINE = 0.15
 """A surface seen more obliquely than this tells little about its height."""
 
-MOST_VIEWS = 9
+MOST_VIEWS = 16
 MOST_UNLIKE = 16.0
 """A vertex counts as at most this much sharper or less sharp than is usual: beyond, its own figure is chance."""
-SUPPORT_ROUNDS = 8
-"""Steps from vertex to vertex, half of each back: about two edges of the mesh, one standard deviation."""
+SUPPORT_ROUNDS = 16
+"""Steps from vertex to vertex, half of each back: about three edges of the mesh, one standard deviation."""
 LEAST_SUPPORT = 0.05
 STEP_REACH_MM = 0.17
 STEEP_MM = 2 * STEP_REACH_MM * float(np.tan(np.radians(60)))
@@ -104,7 +105,26 @@ def mesh_sigma(
     refined: Refined, maps: tuple[DepthMap, ...], poses: tuple[Pose, ...], *, workers: int = 1
 ) -> NDArray[np.float32]:
     """Standard deviation (V,) mm of a refined mesh's vertices."""
-    return Evidence.of(refined, vertex_scatter(refined.mesh, maps, poses, workers=workers)).sigma()
+    return Evidence.of(refined, refined_scatter(refined, maps, poses, workers=workers)).sigma()
+
+
+def refined_scatter(
+    refined: Refined, maps: tuple[DepthMap, ...], poses: tuple[Pose, ...], *, workers: int = 1
+) -> NDArray[np.float32]:
+    """:func:`vertex_scatter` (V,) mm of a refined mesh: new vertices scatter as those do that they lie between."""
+    mesh, parents = refined.mesh, refined.parents
+    own = parents[:, 0] == parents[:, 1]
+    known = int(own.sum())
+    before = replace(mesh, vertices=mesh.vertices[:known], normals=mesh.normals[:known])
+    scatter = np.zeros(len(own), np.float32)
+    scatter[:known] = vertex_scatter(before, maps, poses, workers=workers)
+    while known < len(own):
+        # Those whose parents are known; their own children come after them.
+        ready = known + int(np.searchsorted(parents[known:].max(1) >= known, True))
+        ready = ready if ready > known else len(own)
+        scatter[known:ready] = scatter[parents[known:ready]].mean(1)
+        known = ready
+    return scatter
 
 
 def bend_mm(mesh: Mesh) -> NDArray[np.float32]:

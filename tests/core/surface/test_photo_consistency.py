@@ -15,9 +15,11 @@ from specimap_core.surface.fusion import Mesh
 from specimap_core.surface.photo_consistency import (
     HIGHLIGHT,
     LEAST_WITHOUT_HIGHLIGHTS,
+    OWN_VARIANCE,
+    Contrasts,
     Photographs,
+    agreement,
     choose_views,
-    patch_scores,
 )
 
 LENS = Intrinsics.centred(240, 240, 480.0)
@@ -25,7 +27,7 @@ CAMERAS = 10
 DISTANCE_MM, SPREAD_MM = 100.0, 40.0
 TEXEL_MM = 0.1
 SIDE_MM = 60.0
-SAMPLE_MM = DISTANCE_MM / LENS.focal_px
+SURROUNDINGS_PX = 3.0
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -53,7 +55,7 @@ def plane() -> Photographs:
     for pose in poses:
         pixel_from_plane = LENS.matrix @ np.c_[pose.R[:, :2], pose.t]
         grey = cv2.warpPerspective(texture, pixel_from_plane @ plane_from_texel, (LENS.width, LENS.height))
-        greys.append(np.asarray(np.clip(grey + rng.normal(0, 1, grey.shape), 0, 255), np.float32))
+        greys.append(np.clip(grey + rng.normal(0, 1, grey.shape), 0, 255).astype(np.uint8))
     return Photographs(greys, LENS, poses)
 
 
@@ -76,41 +78,63 @@ def chosen(plane: Photographs, z: float = 0.0, most: int = 6) -> NDArray[np.int6
     return choose_views(mesh, np.arange(len(mesh.vertices)), plane, most, 0.25)
 
 
-def peaks(plane: Photographs, z: float, half: int) -> Floats:
-    """Offsets (n,) mm at which the patches of a plane at ``z`` agree best."""
-    mesh, offsets = grid(z), np.linspace(-0.8, 0.8, 33)
-    points = mesh.vertices.astype(float)
-    normals = np.tile(UP, (len(points), 1))
-    scores = patch_scores(points, normals, chosen(plane, z), plane, offsets, SAMPLE_MM, half)
-    assert scores.shape == (len(points), len(offsets))
-    assert scores.max() <= 1
-    return np.asarray(offsets[scores.argmax(1)])
+def scores(plane: Photographs, points: Floats, views: NDArray[np.int64], offsets: Floats) -> Floats:
+    """Correlations (n, steps) of single pixels' contrasts, without surroundings to average over."""
+    contrasts = Contrasts.of(plane, SURROUNDINGS_PX, 0.0)
+    product, square = agreement(points, np.tile(UP, (len(points), 1)), views, contrasts, offsets)
+    assert product.shape == square.shape == (len(points), len(offsets))
+    return np.asarray(product / (square + OWN_VARIANCE))
 
 
-@pytest.mark.parametrize("half", [1, 2])
 @pytest.mark.parametrize("z", [-0.3, 0.0, 0.4])
-def test_photos_agree_best_on_the_true_surface(plane: Photographs, z: float, half: int) -> None:
-    off = peaks(plane, z, half) + z
-    assert abs(float(np.median(off))) < 0.03
-    # Noise leaves something: nothing at all would be no measurement.
-    assert 0.001 < np.abs(off).mean() < 0.12
+def test_photos_agree_best_on_the_true_surface(plane: Photographs, z: float) -> None:
+    mesh, offsets = grid(z), np.linspace(-0.8, 0.8, 33)
+    contrasts = Contrasts.of(plane, SURROUNDINGS_PX, 0.0)
+    points = mesh.vertices.astype(float)
+    product, square = agreement(points, np.tile(UP, (len(points), 1)), chosen(plane, z), contrasts, offsets)
+    # All together have one best offset; single pixels may have others that are as good.
+    whole = product.sum(0) / square.sum(0)
+    assert 0.6 < whole.max() < 1
+    assert abs(offsets[whole.argmax()] + z) < 0.06
+    alone = offsets[(product / (square + OWN_VARIANCE)).argmax(1)] + z
+    assert 0.001 < np.median(np.abs(alone)) < 0.3
 
 
-def test_alike_patches_score_high_on_the_surface_and_low_off_it(plane: Photographs) -> None:
+def test_contrasts_agree_on_the_surface_and_not_off_it(plane: Photographs) -> None:
+    found = scores(plane, grid(0.0).vertices.astype(float), chosen(plane), np.array([-3.0, 0.0, 3.0]))
+    off, on, other = np.median(found, axis=0)
+    assert 0.6 < on < 1
+    assert max(off, other) < 0.3
+
+
+def test_a_place_that_one_photo_sees_agrees_with_nothing(plane: Photographs) -> None:
     points = grid(0.0).vertices.astype(float)
-    normals = np.tile(UP, (len(points), 1))
-    scores = patch_scores(points, normals, chosen(plane), plane, np.array([0.0, 3.0]), SAMPLE_MM, 2)
-    assert 0.8 < np.median(scores[:, 0]) < 1
-    assert np.median(scores[:, 1]) < 0.4
+    offsets = np.array([0.0, 0.1])
+    one, none, two = (
+        scores(plane, points, np.tile(views, (len(points), 1)), offsets)[:, 0] for views in ([0, -1], [-1, -1], [0, 1])
+    )
+    assert one == pytest.approx(0, abs=1e-5)
+    assert not none.any()
+    assert np.median(two) > 0.5
 
 
-def test_a_patch_that_one_photo_sees_agrees_with_nothing(plane: Photographs) -> None:
-    points = grid(0.0).vertices[:3].astype(float)
-    views = np.array([[0, -1], [-1, -1], [0, 1]])
-    scores = patch_scores(points, np.tile(UP, (3, 1)), views, plane, np.zeros(1), SAMPLE_MM, 2)[:, 0]
-    assert scores[0] == pytest.approx(0, abs=1e-5)
-    assert scores[1] == 0
-    assert scores[2] > 0.5
+def test_gain_offset_and_shading_are_gone_from_contrast(plane: Photographs) -> None:
+    ramp = np.linspace(0.6, 1.0, LENS.width)
+    shaded = [np.asarray(np.clip(g * ramp, 0, 255), np.uint8) for g in plane.greys]
+    before = Contrasts.of(plane, SURROUNDINGS_PX, 0.0).sheet
+    after = Contrasts.of(replace(plane, greys=shaded), SURROUNDINGS_PX, 0.0).sheet
+    assert before.std() == pytest.approx(1, abs=0.3)
+    assert float(np.corrcoef(before.ravel(), after.ravel())[0, 1]) > 0.97
+
+
+def test_beyond_a_photo_lies_its_border_and_not_the_next_photo(plane: Photographs) -> None:
+    greys = [np.full_like(plane.greys[0], 100), plane.greys[1]]
+    contrasts = Contrasts.of(replace(plane, greys=greys, poses=plane.poses[:2]), SURROUNDINGS_PX, 0.0)
+    beyond = np.array([[[LENS.width + 3.0, 50.0], [50.0, LENS.height + 40.0]]], np.float32)
+    assert contrasts.at(np.zeros((1, 2), np.int64), beyond) == pytest.approx(0, abs=1e-4)
+    inside = np.array([[[120.0, 90.0]]], np.float32)
+    row, column = 90, LENS.width + 120
+    assert contrasts.at(np.ones((1, 1), np.int64), inside)[0, 0] == pytest.approx(contrasts.sheet[row, column])
 
 
 def test_photos_that_show_a_highlight_are_left_out(plane: Photographs) -> None:
@@ -118,9 +142,9 @@ def test_photos_that_show_a_highlight_are_left_out(plane: Photographs) -> None:
     greys = list(plane.greys)
     for k in lit:
         at = plane.lens.project(plane.poses[k].apply(np.zeros(3)))
-        spot = np.zeros_like(greys[k])
+        spot = np.zeros(greys[k].shape, np.float32)
         cv2.circle(spot, (round(at[0]), round(at[1])), 12, 1.0, -1)
-        greys[k] = np.clip(greys[k] + 60 * cv2.GaussianBlur(spot, (0, 0), 3), 0, 255).astype(np.float32)
+        greys[k] = np.clip(greys[k] + 60 * cv2.GaussianBlur(spot, (0, 0), 3), 0, 255).astype(np.uint8)
     glossy = replace(plane, greys=greys)
     middle = np.linalg.norm(grid(0.0).vertices[:, :2], axis=1) < 1.5
     rim = np.linalg.norm(grid(0.0).vertices[:, :2], axis=1) > 7
@@ -131,7 +155,7 @@ def test_photos_that_show_a_highlight_are_left_out(plane: Photographs) -> None:
 
 
 def test_a_bright_photo_is_no_highlight(plane: Photographs) -> None:
-    greys = [np.asarray(g * (1.5 if k == 4 else 1.0), np.float32) for k, g in enumerate(plane.greys)]
+    greys = [np.clip(g * (1.5 if k == 4 else 1.0), 0, 255).astype(np.uint8) for k, g in enumerate(plane.greys)]
     assert HIGHLIGHT < 1.5
     even = chosen(plane, most=CAMERAS)
     bright = chosen(replace(plane, greys=greys), most=CAMERAS)
@@ -162,7 +186,6 @@ def test_more_vertices_than_one_look_up_takes(plane: Photographs) -> None:
     assert len(x) > 32_767
     views = choose_views(mesh, np.arange(len(x)), plane, 6, 0.25)
     assert (views[:, :LEAST_WITHOUT_HIGHLIGHTS] >= 0).all()
-    offsets = np.array([0.0, 3.0])
-    scores = patch_scores(vertices.astype(float), normals, views, plane, offsets, SAMPLE_MM, 1)
-    assert 0.6 < np.median(scores[:, 0]) < 1
-    assert np.median(scores[:, 1]) < 0.5
+    found = scores(plane, vertices.astype(float), views, np.array([0.0, 3.0]))
+    assert 0.6 < np.median(found[:, 0]) < 1
+    assert np.median(found[:, 1]) < 0.3

@@ -24,6 +24,7 @@ from specimap_core.surface.uncertainty import (
     bend_mm,
     mesh_sigma,
     point_sigma,
+    refined_scatter,
     step_height,
     support,
     vertex_scatter,
@@ -150,7 +151,7 @@ def test_stated_and_true_errors_of_a_mesh_go_together(after: Refined) -> None:
     assert sigma.dtype == np.float32
     assert sigma.min() >= np.float32(LEAST_SIGMA_MM)
     assert sigma.max() <= UNSEEN_SIGMA_MM
-    of = scene.mesh.vertices[:, 2] > 1.0
+    of = after.mesh.vertices[:, 2] > 1.0
     off, stated = np.abs(scene.off_mm(after.mesh)[of]), sigma[of]
     low, high = np.percentile(stated, [25, 75])
     assert np.nanmedian(off[stated <= low]) < np.nanmedian(off[stated >= high])
@@ -161,7 +162,7 @@ def test_fewer_views_and_less_agreement_make_a_mesh_less_sure(after: Refined) ->
     done = (after.views > 0) & np.isfinite(after.sharpness)
     plain = mesh_sigma(after, scene.maps, scene.poses)
     fewer = replace(after, views=np.where(done, 3, 0).astype(np.uint8))
-    all_views = replace(after, views=np.where(done, 9, 0).astype(np.uint8))
+    all_views = replace(after, views=np.where(done, 16, 0).astype(np.uint8))
     assert (mesh_sigma(fewer, scene.maps, scene.poses) >= mesh_sigma(all_views, scene.maps, scene.poses)).all()
     for doubtful in (
         replace(after, found=after.found & (np.arange(len(done)) % 2 == 0)),
@@ -210,16 +211,14 @@ def test_support_is_the_share_of_the_surroundings_that_photos_told(after: Refine
 def test_photos_that_agree_on_nothing_leave_the_scatter_of_the_depths(after: Refined) -> None:
     scene = matched(SEED)
     flat = replace(after, sharpness=np.zeros_like(after.sharpness))
-    assert np.array_equal(
-        mesh_sigma(flat, scene.maps, scene.poses), vertex_scatter(after.mesh, scene.maps, scene.poses)
-    )
+    assert np.array_equal(mesh_sigma(flat, scene.maps, scene.poses), refined_scatter(after, scene.maps, scene.poses))
 
 
 def test_unrefined_vertices_keep_the_scatter_of_the_depths(after: Refined) -> None:
     scene = matched(SEED)
     idle = after.views == 0
     assert idle.any()
-    scatter = vertex_scatter(after.mesh, scene.maps, scene.poses, workers=2)
+    scatter = refined_scatter(after, scene.maps, scene.poses, workers=2)
     assert mesh_sigma(after, scene.maps, scene.poses)[idle] == pytest.approx(scatter[idle], rel=1e-6)
     # Depths scatter about what was fused of them by a part of a voxel, not by nothing.
     assert 0.01 < np.median(scatter[idle]) < scene.voxel_mm
