@@ -132,9 +132,9 @@ def vertex_normals(vertices: NDArray[np.float32], triangles: NDArray[np.int32]) 
     """Area-weighted unit normals (V, 3)."""
     corners: Floats = vertices.astype(float)[triangles]
     face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = np.stack(
-        [np.bincount(triangles.ravel(), np.repeat(face[:, k], 3), minlength=len(vertices)) for k in range(3)],
-        -1,
-    )
+    normals = np.zeros((len(vertices), 3))
+    for corner in triangles.T:
+        for k in range(3):
+            normals[:, k] += np.bincount(corner, face[:, k], minlength=len(vertices))
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return np.asarray(normals / np.maximum(length, 1e-12), np.float32)

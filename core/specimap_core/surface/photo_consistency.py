@@ -183,21 +183,19 @@ def agreement(
     lens, poses = photographs.lens, photographs.poses
     # Photos first: sums over them are then of whole rows.
     photo = np.ascontiguousarray(np.maximum(views, 0).T)
+    unused = views.T < 0
     R, t = np.stack([p.R for p in poses]), np.stack([p.t for p in poses])
-    towards = np.stack([p.centre for p in poses])[photo] - points
-    length = np.maximum(np.linalg.norm(towards, axis=2), 1e-9)
-    cosine = np.einsum("kni,ni->kn", towards, directions) / length
-    weight = np.where(views.T >= 0, np.clip(cosine, 0.02, 1) ** OBLIQUE, 0).astype(np.float32)
+    x, y, z = ((c - points[:, i]) for i, c in enumerate(np.stack([p.centre for p in poses]).T[:, photo]))
+    length = np.sqrt(x * x + y * y + z * z)
+    cosine = (x * directions[:, 0] + y * directions[:, 1] + z * directions[:, 2]) / np.maximum(length, 1e-9)
+    weight = np.where(unused, 0, np.clip(cosine, 0.02, 1) ** OBLIQUE).astype(np.float32)
     # Over a millimetre the projection is linear to a hundredth of a pixel.
-    turns = R[photo]
-    cam = np.einsum("knij,nj->kni", turns, points) + t[photo]
+    cam = _turned(R, photo, points) + t[photo]
     # Where no photo is compared, any place before the camera will do.
-    cam[views.T < 0] = (0.0, 0.0, 1.0)
+    cam[unused] = (0.0, 0.0, 1.0)
     base = lens.project(cam)
     small = offsets[-1] / 2
-    step = ((lens.project(cam + small * np.einsum("knij,nj->kni", turns, directions)) - base) / small).astype(
-        np.float32
-    )
+    step = ((lens.project(cam + small * _turned(R, photo, directions)) - base) / small).astype(np.float32)
     base = base.astype(np.float32)
     total, squares = weight.sum(0), (weight * weight).sum(0)
     pairs, singles = np.maximum(total * total - squares, 1e-4), np.maximum(total, 1e-3)
@@ -208,3 +206,9 @@ def agreement(
         product[:, k] = (weighted.sum(0) ** 2 - (weighted * weighted).sum(0)) / pairs
         square[:, k] = (weighted * seen).sum(0) / singles
     return product, square
+
+
+def _turned(R: Floats, photo: Ints, vectors: Floats) -> Floats:
+    """Vectors (n, 3), turned by the ``R`` (P, 3, 3) of photos (k, n): (k, n, 3)."""
+    x, y, z = vectors.T
+    return np.stack([R[photo, i, 0] * x + R[photo, i, 1] * y + R[photo, i, 2] * z for i in range(3)], -1)
