@@ -16,10 +16,12 @@ pytest_plugins = (
     "tests.support.shared_folders",
     "tests.support.scenes",
     "tests.support.service_scene",
+    "tests.support.backup_scene",
     "tests.support.client_scene",
     "tests.support.da3_scene",
     "tests.support.feature_scene",
     "tests.support.secret_file",
+    "tests.support.json_line_scene",
     "tests.support.webhook_receiver",
 )
 
