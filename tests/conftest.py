@@ -15,6 +15,7 @@ pytest_plugins = (
     "tests.support.databases",
     "tests.support.shared_folders",
     "tests.support.scenes",
+    "tests.support.reruns",
     "tests.support.service_scene",
     "tests.support.backup_scene",
     "tests.support.client_scene",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -29,6 +30,19 @@ def refined(scene: Matched, settings: RefineSettings = SETTINGS, worth: NDArray[
     )
 
 
+@cache
+def refined_whole(seed: int) -> Refined:
+    """All of a scene's mesh, refined once for the tests that look at it."""
+    return refined(matched(seed))
+
+
+@cache
+def refined_worth(seed: int) -> Refined:
+    """The part of a scene's mesh that is worth it, refined once for the tests that look at it."""
+    scene = matched(seed)
+    return refined(scene, worth=scene.worth)
+
+
 def tissue(scene: Matched) -> NDArray[np.bool_]:
     """Vertices of the specimen, the cards left out: these carry hard edges at 1 mm above the tray and less."""
     return np.asarray(scene.mesh.vertices[:, 2] > 1.0)
@@ -39,7 +53,7 @@ def test_each_pass_brings_the_surface_nearer_to_truth(seed: int) -> None:
     scene = matched(seed)
     of = tissue(scene)
     medians, tails = [], []
-    for mesh in (scene.mesh, refined(scene, FIRST).mesh, refined(scene).mesh):
+    for mesh in (scene.mesh, refined(scene, FIRST).mesh, refined_whole(seed).mesh):
         off = np.abs(scene.off_mm(mesh)[of])
         assert np.isfinite(off).mean() > 0.98
         medians.append(float(np.nanmedian(off)))
@@ -71,7 +85,7 @@ def test_vertices_that_are_not_worth_it_keep_their_places() -> None:
 
 def test_what_is_not_worth_it_changes_nothing_within_the_rest() -> None:
     scene = matched(SEEDS[0])
-    some, every = refined(scene, worth=scene.worth), refined(scene)
+    some, every = refined_worth(SEEDS[0]), refined_whole(SEEDS[0])
     inner = scene.mesh.vertices[:, 2] > 4.0
     apart = np.linalg.norm(some.mesh.vertices - every.mesh.vertices, axis=1)[inner]
     # Vertices weigh by the median of those refined, so that nothing is quite the same; below the least standard
@@ -81,7 +95,7 @@ def test_what_is_not_worth_it_changes_nothing_within_the_rest() -> None:
 
 def test_views_and_how_they_agree_are_told() -> None:
     scene = matched(SEEDS[0])
-    after = refined(scene, worth=scene.worth)
+    after = refined_worth(SEEDS[0])
     views = after.views[scene.worth]
     assert views.max() == 9
     assert views.max() <= len(scene.images)
@@ -100,7 +114,7 @@ def test_views_and_how_they_agree_are_told() -> None:
 
 def test_places_where_agreement_is_sharp_are_the_better_ones() -> None:
     scene = matched(SEEDS[0])
-    after = refined(scene, worth=scene.worth)
+    after = refined_worth(SEEDS[0])
     of = tissue(scene)
     off, sharpness = np.abs(scene.off_mm(after.mesh)[of]), after.sharpness[of]
     low, high = np.percentile(sharpness, [25, 75])
@@ -136,7 +150,7 @@ def test_the_order_of_vertices_hardly_matters() -> None:
     m = scene.mesh
     mixed = Mesh(m.vertices[order], place[m.triangles].astype(np.int32), m.normals[order], m.colours[order])
     again = refine_mesh(mixed, scene.greys, scene.lens, scene.poses, scene.voxel_mm, SETTINGS, workers=1)
-    apart = np.linalg.norm(again.mesh.vertices[place] - refined(scene).mesh.vertices, axis=1)
+    apart = np.linalg.norm(again.mesh.vertices[place] - refined_whole(SEEDS[0]).mesh.vertices, axis=1)
     # Sums in another order differ in their last bits, which an interpolation in steps of 1/32 pixel makes larger.
     assert np.median(apart) < 1e-3
     assert np.percentile(apart, 99) < LEAST_SIGMA_MM
