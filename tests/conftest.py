@@ -15,11 +15,14 @@ pytest_plugins = (
     "tests.support.databases",
     "tests.support.shared_folders",
     "tests.support.scenes",
+    "tests.support.reruns",
     "tests.support.service_scene",
+    "tests.support.backup_scene",
     "tests.support.client_scene",
     "tests.support.da3_scene",
     "tests.support.feature_scene",
     "tests.support.secret_file",
+    "tests.support.json_line_scene",
     "tests.support.webhook_receiver",
 )
 

@@ -1,4 +1,4 @@
-"""Databases of a PostgreSQL server to measure on, where one answers (PGHOST, PGPORT, PGUSER, ...)."""
+"""Databases of a PostgreSQL server to measure and to test on, where one answers (PGHOST, PGPORT, PGUSER, ...)."""
 
 from __future__ import annotations
 
@@ -35,12 +35,18 @@ def postgres_version() -> str | None:
 @contextmanager
 def postgres_url() -> Iterator[str]:
     """URL of an empty database of its own, dropped afterwards."""
-    name = f"specimap_bench_{uuid.uuid4().hex[:12]}"
-    with connect() as server:
-        server.execute(sql.SQL("CREATE DATABASE {}").format(sql.Identifier(name)))
-        info = server.info
-        account = f"{info.user}:{info.password}" if info.password else info.user
-        try:
-            yield f"postgresql://{account}@{info.host}:{info.port}/{name}"
-        finally:
-            server.execute(sql.SQL("DROP DATABASE {} WITH (FORCE)").format(sql.Identifier(name)))
+    with connect() as server, empty_database(server, "specimap_bench_") as url:
+        yield url
+
+
+@contextmanager
+def empty_database(server: psycopg.Connection, prefix: str) -> Iterator[str]:
+    """URL of an empty database in ``server``, its name with this ``prefix``, dropped afterwards."""
+    name = f"{prefix}{uuid.uuid4().hex[:12]}"
+    server.execute(sql.SQL("CREATE DATABASE {}").format(sql.Identifier(name)))
+    info = server.info
+    account = f"{info.user}:{info.password}" if info.password else info.user
+    try:
+        yield f"postgresql://{account}@{info.host}:{info.port}/{name}"
+    finally:
+        server.execute(sql.SQL("DROP DATABASE {} WITH (FORCE)").format(sql.Identifier(name)))

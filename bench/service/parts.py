@@ -11,7 +11,8 @@ from bench.service.clouds import bench_cloud, sheet_cloud
 from bench.service.jobs import bench_jobs, sheet_jobs
 from bench.service.neighbour import bench_neighbour, sheet_neighbour
 from bench.service.options import Options
-from bench.service.scale import bench_scale, sheet_scale
+from bench.service.scale import bench_scale
+from bench.service.scale_sheets import sheet_scale
 from bench.service.shard import bench_shard, sheet_shard
 from bench.service.sheet import Sheet
 from bench.service.spectrum import bench_spectrum, sheet_spectrum

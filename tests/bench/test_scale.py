@@ -7,7 +7,8 @@ import sqlalchemy as sa
 
 from bench.service.claimers import claim
 from bench.service.full_queue import SMALL, fill
-from bench.service.scale import NAMES, sheet_scale
+from bench.service.scale import NAMES
+from bench.service.scale_sheets import sheet_scale
 from specimap_infra.database import Database
 from specimap_infra.job_schemas import queue_positions
 from specimap_infra.queue import JOBS, queue_client

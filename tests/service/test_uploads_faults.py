@@ -6,14 +6,11 @@ import base64
 import errno
 import hashlib
 import os
-import socket
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
-import numpy as np
 import pytest
 
 from specimap_infra.database import utc_now
@@ -24,25 +21,23 @@ from specimap_service.uploads.lifecycle import Uploads
 from specimap_service.uploads.sweeping import sweep
 from tests.support.service_scene import Running
 from tests.support.upload_scene import (
-    OCTETS,
     TUS,
     BreakingProxy,
+    begun,
     client_at,
     created,
     key_in,
     new_acquisition,
+    noise,
     offset_of,
     patch,
     photos,
     process_serving,
     result,
+    until_offset,
 )
 
 PHOTO = photos()[0].read_bytes()
-
-
-def noise(size: int) -> bytes:
-    return np.random.default_rng(0).bytes(size)
 
 
 def test_a_connection_that_breaks_ten_times(service: Running) -> None:
@@ -74,38 +69,14 @@ def test_a_connection_that_breaks_ten_times(service: Running) -> None:
         assert b"".join(back.iter_bytes()) == data
 
 
-def until(client: httpx.Client, at: str, least: int) -> int:
-    deadline = time.monotonic() + 20
-    while (offset := offset_of(client, at)) < least:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    return offset
-
-
-def half_sent(url: str, at: str, key: str, data: bytes, upto: int) -> socket.socket:
-    """A connection on which a PATCH was begun and no more comes."""
-    lines = {
-        **TUS,
-        "Host": "x",
-        "Authorization": f"Bearer {key}",
-        "Upload-Offset": "0",
-        "Content-Type": OCTETS,
-        "Content-Length": str(len(data)),
-    }
-    head = f"PATCH {at} HTTP/1.1\r\n" + "".join(f"{k}: {v}\r\n" for k, v in lines.items()) + "\r\n"
-    connection = socket.create_connection(("127.0.0.1", int(url.rsplit(":", 1)[1])))
-    connection.sendall(head.encode() + data[:upto])
-    return connection
-
-
 @pytest.mark.slow
 def test_a_process_killed_in_the_middle_of_a_chunk(tmp_path: Path) -> None:
     data = noise(20_000_000)
     key = key_in(tmp_path)
     with process_serving(tmp_path) as (process, url), client_at(url, key) as client:
         at = created(client, new_acquisition(client), "cube", len(data), "x.raw")
-        connection = half_sent(url, at, key, data, 13_000_000)
-        described = until(client, at, 8_000_000)
+        connection = begun(url, at, key, data, 0, 13_000_000)
+        described = until_offset(client, at, 8_000_000)
         process.kill()
         process.wait()
         connection.close()
@@ -205,7 +176,7 @@ def test_two_clients_at_once(service: Running, monkeypatch: pytest.MonkeyPatch) 
 
     first = threading.Thread(target=lambda: answers.append(patch(client, at, alive(), 0).status_code))
     first.start()
-    offset = until(second, at, 1_000_000)
+    offset = until_offset(second, at, 1_000_000)
     busy = patch(second, at, data[offset:], offset)
     assert busy.status_code == 423
     assert busy.json()["code"] == "upload_locked"
@@ -275,8 +246,8 @@ def test_a_dead_connection_gives_way(service: Running, monkeypatch: pytest.Monke
     client = service.client()
     at = created(client, new_acquisition(client), "cube", len(data), "x.raw")
     key = client.headers["Authorization"].removeprefix("Bearer ")
-    connection = half_sent(service.url, at, key, data, 3_000_000)  # then the network falls away without a word
-    offset = until(client, at, 2_000_000)
+    connection = begun(service.url, at, key, data, 0, 3_000_000)  # then the network falls away without a word
+    offset = until_offset(client, at, 2_000_000)
     answer = patch(client, at, data[offset:], offset)
     if answer.status_code == 409:  # the dead one's last bytes were written when it gave way
         offset = offset_of(client, at)

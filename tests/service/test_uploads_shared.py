@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import os
-import socket
 import subprocess
 import threading
 import time
@@ -16,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-import numpy as np
 import pytest
 import sqlalchemy as sa
 
@@ -34,25 +32,23 @@ from tests.support.object_store import object_store
 from tests.support.round_robin import RoundRobin
 from tests.support.service_scene import Running, serving
 from tests.support.upload_scene import (
-    OCTETS,
     TUS,
+    begun,
     client_at,
     created,
     new_acquisition,
+    noise,
     offset_of,
     patch,
     photos,
     process_serving,
     result,
+    until_offset,
 )
 
 PHOTO = photos()[0].read_bytes()
 MORE = 1_500_000
 """Bytes after which what came before has been gathered."""
-
-
-def noise(size: int) -> bytes:
-    return np.random.default_rng(0).bytes(size)
 
 
 @dataclass
@@ -108,34 +104,6 @@ def site(folder: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[S
         made = Site(folder, given, database, Storage.open(settings), key, stack)
         stack.callback(made.balancer.close)
         yield made
-
-
-def begun(url: str, at: str, key: str, data: bytes, offset: int, upto: int) -> socket.socket:
-    """A connection on which a PATCH of all that is missing was begun, and no more comes."""
-    lines = {
-        **TUS,
-        "Host": "x",
-        "Authorization": f"Bearer {key}",
-        "Upload-Offset": str(offset),
-        "Content-Type": OCTETS,
-        "Content-Length": str(len(data) - offset),
-    }
-    head = f"PATCH {at} HTTP/1.1\r\n" + "".join(f"{k}: {v}\r\n" for k, v in lines.items()) + "\r\n"
-    connection = socket.create_connection(("127.0.0.1", int(url.rsplit(":", 1)[1])))
-    try:
-        connection.sendall(head.encode() + data[offset:upto])
-    except BaseException:
-        connection.close()
-        raise
-    return connection
-
-
-def until_offset(client: httpx.Client, at: str, least: int) -> int:
-    deadline = time.monotonic() + 30
-    while (offset := offset_of(client, at)) < least:
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    return offset
 
 
 @pytest.mark.slow

@@ -12,12 +12,21 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import pytest
 
 from specimap_core.errors import NotFoundError
+from specimap_infra.database import Database, utc_now
+from specimap_infra.ids import new_id
 from specimap_infra.references import PLACES
+from specimap_infra.settings import ServiceSettings, load_settings
 from specimap_infra.storage import Storage
+from specimap_infra.tables import (
+    Artefact,
+    Upload,
+)
 from tests.support.databases import postgres_url
 from tests.support.object_store import object_store
+from tests.support.service_scene import Running, serving
 
 PROGRAM = "from specimap_cli import main; main()"
 AWS = {"AWS_ACCESS_KEY_ID": "test", "AWS_SECRET_ACCESS_KEY": "test"}
@@ -74,3 +83,57 @@ def stored(storage: Storage) -> dict[str, bytes]:
         with suppress(NotFoundError):
             found |= {item.key: storage.read(item.key) for item in storage.list(name)}
     return found
+
+
+def add_artefact(database: Database, storage: Storage, acquisition_id: str, stage: str = "render") -> str:
+    key = f"acquisitions/{acquisition_id}/stages/{new_id('att')}.npz"
+    storage.put(key, b"an artefact")
+    with database.session() as session:
+        session.add(
+            Artefact(
+                id=new_id("att"),
+                acquisition_id=acquisition_id,
+                stage=stage,
+                key=new_id("att"),
+                storage_key=key,
+                size=11,
+                seconds=1.0,
+            )
+        )
+    return key
+
+
+def add_upload(database: Database, acquisition_id: str, state: str) -> str:
+    upload_id = new_id("up")
+    with database.session() as session:
+        session.add(
+            Upload(
+                id=upload_id,
+                acquisition_id=acquisition_id,
+                role="photo",
+                name="x.jpg",
+                size=9,
+                state=state,
+                expires_at=utc_now(),
+                created_by="key_test",
+            )
+        )
+    return upload_id
+
+
+def fake_capture(folder: Path) -> tuple[Path, Path]:
+    """Files that stand in for photos and a cube; the quick stages read neither."""
+    photos = folder / "photos"
+    photos.mkdir(parents=True)
+    for number in range(6):
+        (photos / f"{number}.jpg").write_bytes(b"photo %d" % number)
+    (folder / "scan.hdr").write_bytes(b"ENVI")
+    (folder / "scan.raw").write_bytes(b"\0" * 64)
+    return photos, folder / "scan.hdr"
+
+
+@pytest.fixture
+def restored_pair(any_database: str, tmp_path: Path) -> Iterator[tuple[Running, ServiceSettings]]:
+    """A service on SQLite, and settings of an empty place on a database of each kind."""
+    with serving(tmp_path / "old") as service:
+        yield service, load_settings(data_dir=tmp_path / "new", database_url=any_database)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
-import uuid
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import cache
@@ -15,6 +13,7 @@ import pytest
 import sqlalchemy as sa
 from psycopg import sql
 
+from bench.service.databases import connect, empty_database
 from specimap_infra.database import Database
 from specimap_infra.migrate import migrate
 
@@ -25,12 +24,7 @@ TEST_DATABASE = "specimap_test_"
 def postgres_server() -> psycopg.Connection:
     """A connection to the server's own database; skips the test where none answers."""
     try:
-        return psycopg.connect(
-            host=os.environ.get("PGHOST", "127.0.0.1"),
-            dbname=os.environ.get("PGDATABASE", "postgres"),
-            connect_timeout=3,
-            autocommit=True,
-        )
+        return connect()
     except psycopg.OperationalError as error:
         pytest.skip(f"no PostgreSQL server answers: {error}")
 
@@ -38,15 +32,8 @@ def postgres_server() -> psycopg.Connection:
 @contextmanager
 def postgres_url() -> Iterator[str]:
     """URL of an empty database of its own, dropped afterwards."""
-    name = f"{TEST_DATABASE}{uuid.uuid4().hex[:12]}"
-    with postgres_server() as server:
-        server.execute(sql.SQL("CREATE DATABASE {}").format(sql.Identifier(name)))
-        info = server.info
-        account = f"{info.user}:{info.password}" if info.password else info.user
-        try:
-            yield f"postgresql://{account}@{info.host}:{info.port}/{name}"
-        finally:
-            server.execute(sql.SQL("DROP DATABASE {} WITH (FORCE)").format(sql.Identifier(name)))
+    with postgres_server() as server, empty_database(server, TEST_DATABASE) as url:
+        yield url
 
 
 def sqlalchemy_url(url: str) -> str:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from specimap_core.pipeline.outputs import Inputs
 from specimap_core.pipeline.run import run_pipeline
@@ -14,9 +16,32 @@ from specimap_core.truth.truth_file import save_truth
 from specimap_validation.phantom import Phantom, PhantomSettings, write_cube
 from specimap_validation.phantom.render import CLASS_CARD
 from tests.support.scenes import Finished, OnDisk
+from tests.support.shared_folders import SharedFolders
 
 COVER = 5000
 """What the cube shows of a covered card."""
+
+
+@dataclass(frozen=True)
+class Reruns:
+    """Reruns of the ``finished`` run on the ``small`` phantom, each made once for all processes."""
+
+    shared_folders: SharedFolders
+    finished: Finished
+    small: OnDisk
+
+    def on(self, settings: PhantomSettings, hidden: tuple[int, ...] = ()) -> tuple[Path, Report]:
+        """Folder with ``hsi``, ``truth.npz`` and ``out``, and the report: see :func:`rerun`. Nobody changes it."""
+        folder = self.shared_folders.made(
+            "rerun", (settings, hidden), lambda folder: rerun(self.finished, self.small, folder, settings, hidden)
+        )
+        return folder, Report.model_validate_json((folder / "out" / "report.json").read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="session")
+def reruns(shared_folders: SharedFolders, finished: Finished, small: OnDisk) -> Reruns:
+    """The finished run's photos with other cubes."""
+    return Reruns(shared_folders, finished, small)
 
 
 def rerun(

@@ -29,6 +29,7 @@ from specimap_validation.phantom import PhantomSettings, load_truth, write_cube,
 from tests.support.shared_folders import SharedFolders
 
 SMALL = PhantomSettings(photos=12, photo_size=384, cube_rows=128, cube_cols=160, bands=16, mesh_divisions=64)
+TINY = replace(SMALL, photos=8, photo_size=320, mesh_divisions=40, cube_rows=96, cube_cols=120, bands=6)
 EDGE_MM = 6.8
 UNNAMED = {"internal_error", StageFailedError.code}
 """Codes of failures that no check foresaw."""
@@ -261,6 +262,12 @@ def small(shared_folders: SharedFolders) -> OnDisk:
 def other(shared_folders: SharedFolders) -> OnDisk:
     """Another specimen in another layout of markers with the same ids."""
     return shared_phantom(shared_folders, replace(SMALL, seed=2, bands=4))
+
+
+@pytest.fixture(scope="session")
+def tiny(shared_folders: SharedFolders) -> OnDisk:
+    """Eight small photos and a cube of few bands."""
+    return shared_phantom(shared_folders, TINY)
 
 
 @pytest.fixture(scope="session")

@@ -10,12 +10,14 @@ import struct
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 
 from specimap_infra.database import Database
 from specimap_infra.projects import DEFAULT_PROJECT
@@ -216,3 +218,37 @@ class BreakingProxy:
         self._listening.close()
         for thread in self._threads:
             thread.join(timeout=10)
+
+
+def noise(size: int) -> bytes:
+    """Bytes that are the same each time and compress to nothing less."""
+    return np.random.default_rng(0).bytes(size)
+
+
+def begun(url: str, at: str, key: str, data: bytes, offset: int, upto: int) -> socket.socket:
+    """A connection on which a PATCH of all that is missing was begun, and no more comes."""
+    lines = {
+        **TUS,
+        "Host": "x",
+        "Authorization": f"Bearer {key}",
+        "Upload-Offset": str(offset),
+        "Content-Type": OCTETS,
+        "Content-Length": str(len(data) - offset),
+    }
+    head = f"PATCH {at} HTTP/1.1\r\n" + "".join(f"{k}: {v}\r\n" for k, v in lines.items()) + "\r\n"
+    connection = socket.create_connection(("127.0.0.1", int(url.rsplit(":", 1)[1])))
+    try:
+        connection.sendall(head.encode() + data[offset:upto])
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def until_offset(client: httpx.Client, at: str, least: int) -> int:
+    """The upload's offset once it is ``least`` or more."""
+    deadline = time.monotonic() + 30
+    while (offset := offset_of(client, at)) < least:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    return offset

@@ -103,6 +103,7 @@ def test_the_wet_coat_shines_on_the_specimen_alone(plain: TracedPhantom) -> None
     assert glossy[classes == 2].mean() > 10 * glossy[classes != 2].mean()
 
 
+@pytest.mark.slow
 def test_a_specimen_that_moved_has_its_truth_where_the_photos_show_it() -> None:
     still, moved = traced(TINY), traced(replace(TINY, moved_mm=(1.0, 0.0, 0.0), covered=(2,)))
     there = (still.truth.hsi_class == 1) & (moved.truth.hsi_class == 1)

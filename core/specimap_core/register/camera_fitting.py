@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -52,7 +54,7 @@ class TileObservations:
     sigma_px: Floats
     mm_per_px: Floats
 
-    @property
+    @cached_property
     def middle(self) -> Floats:
         """The middle (3,) of all tiles, mm, about which a motion turns."""
         return np.asarray(self.points.mean((0, 1)))
@@ -70,8 +72,19 @@ class TileObservations:
         """By how many standard deviations (T, 2) ``view`` expects it elsewhere, the specimen moved by ``motion`` (6,):
         a rotation vector about the tiles' middle, rad, and a shift, mm. All tiles were measured ``shared_mm`` (2,) away
         from their places, across and down."""
-        points = moved(self.points, motion, self.middle) if motion.any() else self.points
-        return np.asarray((view.project(points).mean(1) + shared_mm / self.mm_per_px - self.pixels) / self.sigma_px)
+        return self.off(self.shown(view, self.after(motion)), shared_mm)
+
+    def after(self, motion: Floats) -> Floats:
+        """The points where the specimen moved by ``motion``."""
+        return moved(self.points, motion, self.middle) if motion.any() else self.points
+
+    def shown(self, view: View, points: Floats) -> Floats:
+        """Mean place (T, 2) of each tile's ``points`` in the cube."""
+        return np.asarray(np.add.reduce(view.project(points), 1) / points.shape[1])
+
+    def off(self, shown: Floats, shared_mm: Floats) -> Floats:
+        """What :meth:`miss` gives, of tiles expected at ``shown`` (T, 2)."""
+        return np.asarray((shown + shared_mm / self.mm_per_px - self.pixels) / self.sigma_px)
 
 
 @dataclass(frozen=True)
@@ -149,6 +162,8 @@ class CameraFit:
 
 MOST_STEPS = 40
 """A fit that has not converged by then is to corners that no camera explains, and its numbers mean little."""
+REMEMBERED = 32
+"""Values of some unknowns for which a fit remembers what they lead to: more than there are unknowns."""
 POSE_PARAMETERS = 6
 """Number of a model's parameters, from the first, that are its pose."""
 
@@ -179,16 +194,38 @@ def fit(
     moving = slice(free, free + (len(NO_MOTION) if motion else 0))
     sharing = slice(moving.stop, moving.stop + (0 if tiles is None else SHARED))
 
-    def residual(x: Floats, base: View, prior: CornerPrior) -> Floats:
-        view = apply_step(base, model.step(x[:free]))
-        miss = view.project(observed.corners) - observed.pixels
-        parts = [prior.whiten(miss), np.array(prior_residuals(view))]
-        if tiles is not None:
-            parts.append(tiles.miss(view, x[moving] if motion else NO_MOTION, x[sharing]).ravel())
-            parts.append(x[sharing] / SHARED_MM)
-        if motion:
-            parts.append(x[moving] / MOTION_SD)
-        return np.concatenate(parts)
+    def residual_about(base: View) -> Callable[[Floats], Floats]:
+        """Residuals by the unknowns. Numeric derivatives change one unknown at a time, so what only the others enter
+        is remembered."""
+        prior = observed.prior_through(base)
+
+        @lru_cache(REMEMBERED)
+        def through(step: bytes) -> tuple[View, Floats]:
+            view = apply_step(base, model.step(np.frombuffer(step)))
+            miss = view.project(observed.corners) - observed.pixels
+            return view, np.concatenate([prior.whiten(miss), prior_residuals(view)])
+
+        @lru_cache(REMEMBERED)
+        def points_after(step: bytes) -> Floats:
+            assert tiles is not None
+            return tiles.after(np.frombuffer(step) if motion else NO_MOTION)
+
+        @lru_cache(REMEMBERED)
+        def shown(step: bytes, moved_by: bytes) -> Floats:
+            assert tiles is not None
+            return tiles.shown(through(step)[0], points_after(moved_by))
+
+        def residual(x: Floats) -> Floats:
+            step, moved_by = x[:free].tobytes(), x[moving].tobytes()
+            parts = [through(step)[1]]
+            if tiles is not None:
+                parts.append(tiles.off(shown(step, moved_by), x[sharing]).ravel())
+                parts.append(x[sharing] / SHARED_MM)
+            if motion:
+                parts.append(x[moving] / MOTION_SD)
+            return np.concatenate(parts)
+
+        return residual
 
     def robust(z: Floats) -> Floats:
         """Soft L1 for corners, which err a little more than stated; Cauchy for tiles, some of which are far off."""
@@ -208,9 +245,8 @@ def fit(
     x, base = np.zeros(sharing.stop), start
     for _ in range(2):
         answer = least_squares(
-            residual,
+            residual_about(base),
             x,
-            args=(base, observed.prior_through(base)),
             x_scale=np.concatenate(scales),
             loss=robust,
             max_nfev=MOST_STEPS,

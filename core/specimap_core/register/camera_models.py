@@ -94,19 +94,20 @@ def apply_step(view: View, x: Floats) -> View:
     """``view`` turned by ``x[:3]``, shifted by ``x[3:6]``, its focal length ``exp(x[6])`` as long and its distance with
     it; its pixels ``exp(x[7])`` as high; with ``x[8]`` more skew, ``x[9]`` more climb and ``x[10]`` more radial
     distortion at the image's corner."""
-    x = np.append(x, np.zeros(PARAMETERS - len(x)))
+    if len(x) < PARAMETERS:
+        x = np.append(x, np.zeros(PARAMETERS - len(x)))
     lens, pose = view.intrinsics, view.cam_from_world
     zoom, higher = (float(v) for v in np.exp(x[6:8]))
     turned = rotation_from_vector(x[:3]) @ pose.R
     focal_px, aspect = lens.focal_px * zoom, lens.aspect * higher
     if not isinstance(view, ScanView):
         k1 = (radial_at_corner(lens) + float(x[10])) / _corner_square(lens.width, lens.height, focal_px)
-        lens = replace(Intrinsics.centred(lens.width, lens.height, focal_px, k1), aspect=aspect)
+        lens = Intrinsics.centred(lens.width, lens.height, focal_px, k1, aspect=aspect)
         return View(lens, Pose(turned, pose.t * zoom + x[3:6]))
     # Along the scan nothing changes with distance, and lines further apart leave the lens as it is.
     if view.along == 0:
         focal_px *= higher
-    lens = replace(Intrinsics.centred(lens.width, lens.height, focal_px), aspect=aspect)
+    lens = Intrinsics.centred(lens.width, lens.height, focal_px, aspect=aspect)
     t = pose.t + x[3:6]
     t[2] = pose.t[2] * zoom + x[5]
     return ScanView(

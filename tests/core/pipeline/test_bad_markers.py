@@ -17,7 +17,7 @@ from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.report.model import Report
 from specimap_core.truth.judge import compare_with_truth
 from tests.support.broken_sets import copied, image_of, without_markers
-from tests.support.scenes import SMALL, OnDisk, phantom_on_disk, read_corners, run_refused, specimap
+from tests.support.scenes import SMALL, TINY, OnDisk, phantom_on_disk, read_corners, run_refused, specimap
 
 # ---- markers --------------------------------------------------------------------------------------------
 
@@ -51,7 +51,7 @@ def test_markers_of_another_dictionary(small: OnDisk, tmp_path: Path, given: str
 
 @pytest.mark.slow
 def test_a_layout_of_one_marker_is_refused_at_the_cube(tmp_path: Path) -> None:
-    phantom = phantom_on_disk(tmp_path, replace(SMALL, marker_ids=(5,), photos=8, bands=4))
+    phantom = phantom_on_disk(tmp_path, replace(TINY, marker_ids=(5,)))
     refusal = run_refused(phantom.photos, phantom.header, tmp_path / "out")
     assert refusal["code"] == "markers_missing_in_cube"
 
@@ -131,10 +131,10 @@ def test_an_edge_that_exif_and_reason_contradict_is_refused(small: OnDisk, tmp_p
 
 
 @pytest.mark.slow
-def test_a_doubtful_edge_is_warned_of(small: OnDisk, tmp_path: Path) -> None:
-    photos = with_subject(small.photos, tmp_path / "photos", 0.4)
+def test_a_doubtful_edge_is_warned_of(tiny: OnDisk, tmp_path: Path) -> None:
+    photos = with_subject(tiny.photos, tmp_path / "photos", 0.4)
     answer = specimap(
-        "run", "--photos", photos, "--cube", small.header, "--out", tmp_path / "out", "--edge-mm", 68, "--json"
+        "run", "--photos", photos, "--cube", tiny.header, "--out", tmp_path / "out", "--edge-mm", 68, "--json"
     )
     assert answer.status == 0
     report = Report.model_validate(answer.events[-1]["report"])

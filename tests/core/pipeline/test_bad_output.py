@@ -5,11 +5,14 @@ from __future__ import annotations
 import errno
 import os
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from specimap_core.errors import PhotosNotConnectedError, SpecimapError
+from specimap_core.register.registration import Registered, register_cube
 from tests.support.scenes import Finished, OnDisk, run_refused, specimap, tree_of
 
 # ---- settings, refused before anything is read ----------------------------------------------------------
@@ -65,7 +68,23 @@ def test_output_folders_that_cannot_be_used(small: OnDisk, tmp_path: Path) -> No
     )
 
 
+@pytest.fixture(scope="module")
+def registered_once() -> Iterator[None]:
+    """The same cube is registered to the same surface once in a module: no disk takes part in that."""
+    found = list[Registered]()
+
+    def register_once(*arguments: Any, **named: Any) -> Registered:
+        if not found:
+            found.append(register_cube(*arguments, **named))
+        return found[0]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("specimap_core.pipeline.register_stage.register_cube", register_once)
+        yield
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("registered_once")
 @pytest.mark.parametrize("step", ["write_mesh_ply", "write_cloud", "write_preview"])
 def test_a_disk_that_refuses_leaves_the_earlier_results(
     small: OnDisk, finished: Finished, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str

@@ -3,24 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from tests.support.scenes import SMALL, UNNAMED, Finished, OnDisk, cube_with, shared_phantom, specimap
-from tests.support.shared_folders import SharedFolders
+from tests.support.scenes import UNNAMED, Finished, OnDisk, cube_with, specimap
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="session")
-def tiny(shared_folders: SharedFolders) -> OnDisk:
-    """Eight small photos and a cube of few bands."""
-    recipe = replace(SMALL, photos=8, photo_size=320, mesh_divisions=40, cube_rows=96, cube_cols=120, bands=6)
-    return shared_phantom(shared_folders, recipe)
 
 
 Picture = np.ndarray[tuple[int, ...], np.dtype[np.uint8]]

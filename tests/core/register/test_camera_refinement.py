@@ -36,8 +36,8 @@ from tests.support.moved_specimen import (
     textured,
     turned,
 )
-from tests.support.reruns import codes, rerun
-from tests.support.scenes import Finished, OnDisk, bump_mesh, phantom_on_disk
+from tests.support.reruns import Reruns, codes
+from tests.support.scenes import bump_mesh, phantom_on_disk
 
 ROWS, COLS = VIEW.intrinsics.height, VIEW.intrinsics.width
 SHARP_PX, BLURRED_PX = 0.02, 0.5
@@ -183,28 +183,28 @@ def resolved(folder: Path) -> tuple[float, float, RefinedCamera]:
 
 
 @pytest.mark.slow
-def test_a_run_with_two_markers_in_the_cube_is_settled(finished: Finished, small: OnDisk, tmp_path: Path) -> None:
-    report = rerun(finished, small, tmp_path, LARGER, (1, 3))
+def test_a_run_with_two_markers_in_the_cube_is_settled(reruns: Reruns) -> None:
+    folder, report = reruns.on(LARGER, (1, 3))
     assert report.marker_ids_in_cube == [0, 2]
     assert "markers_missing_in_cube" in codes(report)
     assert not codes(report) & {"specimen_moved", "cube_camera_loose"}
-    before, after, refined = resolved(tmp_path)
+    before, after, refined = resolved(folder)
     assert refined.specimen_used
     assert refined.marker_sd_mm > LOOSE_MM
     assert 0.003 < after < min(before, 3 * refined.lateral_sd_mm)
     assert report.cube_camera.focal_px == pytest.approx(refined.camera.view.intrinsics.focal_px, rel=1e-3)
     # Half the markers, and the places are about as good as with all of them.
-    error, usual = judge_with_sigma(tmp_path / "out", tmp_path).errors, judge(finished.out, small.folder)
+    error, usual = judge_with_sigma(folder / "out", folder).errors, judge(reruns.finished.out, reruns.small.folder)
     assert 0.02 < error.median < 1.3 * usual.median
 
 
 @pytest.mark.slow
-def test_a_run_states_that_the_specimen_moved_and_follows_it(finished: Finished, small: OnDisk, tmp_path: Path) -> None:
-    usual = judge(finished.out, small.folder)
-    report = rerun(finished, small, tmp_path, replace(LARGER, moved_mm=MOVED_MM, moved_deg=2.0, moved_tilt_deg=1.0), ())
+def test_a_run_states_that_the_specimen_moved_and_follows_it(reruns: Reruns) -> None:
+    usual = judge(reruns.finished.out, reruns.small.folder)
+    folder, report = reruns.on(replace(LARGER, moved_mm=MOVED_MM, moved_deg=2.0, moved_tilt_deg=1.0))
     message = next(w.message for w in report.warnings if w.code == "specimen_moved")
     assert "was followed as that of a rigid body" in message
-    judged = judge_with_sigma(tmp_path / "out", tmp_path)
+    judged = judge_with_sigma(folder / "out", folder)
     # Each spectrum lies on its own tissue, about as well as where nothing moved.
     assert 0.5 * usual.median < judged.errors.median < 0.15
     assert judged.errors.coverage > 0.97
@@ -213,11 +213,11 @@ def test_a_run_states_that_the_specimen_moved_and_follows_it(finished: Finished,
 
 
 @pytest.mark.slow
-def test_a_motion_too_small_for_a_warning_is_followed_too(finished: Finished, small: OnDisk, tmp_path: Path) -> None:
-    usual, moved_mm = judge(finished.out, small.folder), (0.2, -0.15, 0.0)
-    report = rerun(finished, small, tmp_path, replace(LARGER, moved_mm=moved_mm), ())
+def test_a_motion_too_small_for_a_warning_is_followed_too(reruns: Reruns) -> None:
+    usual, moved_mm = judge(reruns.finished.out, reruns.small.folder), (0.2, -0.15, 0.0)
+    folder, report = reruns.on(replace(LARGER, moved_mm=moved_mm))
     assert "specimen_moved" not in codes(report)
-    judged = judge_with_sigma(tmp_path / "out", tmp_path)
+    judged = judge_with_sigma(folder / "out", folder)
     assert 0.5 * usual.median < judged.errors.median < 0.6 * float(np.hypot(*moved_mm[:2]))
     assert judged.within(1) > 0.5
 

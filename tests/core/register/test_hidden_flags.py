@@ -19,10 +19,11 @@ from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.register.settings import Method, RegisterSettings
 from specimap_core.surface.fusion import Mesh
 from specimap_core.surface.raycast import RayCaster
-from specimap_core.truth.truth_file import Truth
-from specimap_validation.phantom import Phantom, PhantomSettings, write_cube, write_phantom
+from specimap_core.truth.truth_file import Truth, save_truth
+from specimap_validation.phantom import Phantom, PhantomSettings, load_truth, write_cube
 from specimap_validation.phantom.specimen import TRAY_Z_MM
-from tests.support.scenes import xyz_image
+from tests.support.scenes import OnDisk, shared_phantom, shared_run, xyz_image
+from tests.support.shared_folders import SharedFolders
 
 pytestmark = pytest.mark.slow
 
@@ -46,44 +47,56 @@ class Hidden:
     truth: Flags
 
 
-def runs(tilt_deg: float, folders: dict[int, Path]) -> dict[Method, list[Hidden]]:
-    """Each specimen's photos with a cube at this tilt, by both methods."""
-    found: dict[Method, list[Hidden]] = {method: [] for method in METHODS}
-    for seed, folder in folders.items():
-        phantom = Phantom(settings(seed, tilt_deg))
-        header = folder / f"hsi-{tilt_deg:g}" / "hsi.hdr"
-        write_cube(phantom.cube(), phantom.settings.wavelengths_nm, header, interleave="bsq")
-        for method in METHODS:
-            out = folder / "out"
-            run_pipeline(Inputs(folder / "rgb", header), out, PipelineSettings(register=RegisterSettings(method)))
-            flag, hidden = (Flag.UNDERCUT, under_tissue) if method == "camera" else (Flag.OCCLUDED, behind_tissue)
-            found[method].append(judged(out, phantom.truth, flag, hidden(out, phantom.truth)))
-    return found
-
-
 def settings(seed: int, tilt_deg: float) -> PhantomSettings:
     return PhantomSettings(seed=seed, hsi_tilt_deg=tilt_deg, bands=4)
 
 
-@pytest.fixture(scope="module")
-def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
-    """Photos of each specimen; where the cube stands does not change them."""
-    found = {seed: tmp_path_factory.mktemp(f"hidden-{seed}") for seed in SEEDS}
-    for seed, folder in found.items():
-        write_phantom(settings(seed, TILTED_DEG), folder)
-    return found
+def runs(shared_folders: SharedFolders, tilt_deg: float) -> dict[Method, list[Hidden]]:
+    """Each specimen's photos with a cube at this tilt, by both methods."""
+    return {method: [run(shared_folders, seed, tilt_deg, method) for seed in SEEDS] for method in METHODS}
+
+
+def run(shared_folders: SharedFolders, seed: int, tilt_deg: float, method: Method) -> Hidden:
+    """One of them. Where the cube stands does not change the photos, so their run is taken over."""
+    written = shared_phantom(shared_folders, settings(seed, TILTED_DEG))
+    first = shared_run(shared_folders, written.folder)
+    if (tilt_deg, method) == (TILTED_DEG, "camera"):
+        return judged(first.out, written.truth, method)
+    cube = written if tilt_deg == TILTED_DEG else shared_cube(shared_folders, settings(seed, tilt_deg))
+
+    def go_on(folder: Path) -> None:
+        out = first.copy_to(folder / "out")
+        report = run_pipeline(
+            Inputs(written.photos, cube.header), out, PipelineSettings(register=RegisterSettings(method))
+        )
+        assert report.reused_stages == ["reconstruct", "adjust", "render"]
+
+    made = shared_folders.made("hidden", (seed, tilt_deg, method), go_on)
+    return judged(made / "out", cube.truth, method)
+
+
+def shared_cube(shared_folders: SharedFolders, settings: PhantomSettings) -> OnDisk:
+    """A phantom's cube without its photos, written once for all processes."""
+
+    def write(folder: Path) -> None:
+        phantom = Phantom(settings)
+        write_cube(phantom.cube(), settings.wavelengths_nm, folder / "hsi" / "hsi.hdr", interleave="bsq")
+        save_truth(phantom.truth, folder / "truth.npz")
+
+    folder = shared_folders.made("cube", settings, write)
+    return OnDisk(folder, load_truth(folder))
 
 
 @pytest.fixture(scope="module")
-def tilted(folders: dict[int, Path]) -> dict[Method, list[Hidden]]:
+def tilted(shared_folders: SharedFolders) -> dict[Method, list[Hidden]]:
     """A cube that looks under the overhang on one side."""
-    return runs(TILTED_DEG, folders)
+    return runs(shared_folders, TILTED_DEG)
 
 
 @pytest.fixture(scope="module")
-def upright(folders: dict[int, Path]) -> dict[Method, list[Hidden]]:
+def upright(shared_folders: SharedFolders) -> dict[Method, list[Hidden]]:
     """A cube from straight above, or nearly."""
-    return runs(UPRIGHT_DEG, folders)
+    return runs(shared_folders, UPRIGHT_DEG)
 
 
 # ---- truth --------------------------------------------------------------------------------------------
@@ -124,7 +137,10 @@ def vertical(points: Floats, z: float) -> Floats:
     return np.broadcast_to([0.0, 0.0, z], points.shape)
 
 
-def judged(out: Path, truth: Truth, flag: Flag, hidden: Flags) -> Hidden:
+def judged(out: Path, truth: Truth, method: Method) -> Hidden:
+    """A run by ``method`` against truth: what that method flags."""
+    flag, hidden_in = (Flag.UNDERCUT, under_tissue) if method == "camera" else (Flag.OCCLUDED, behind_tissue)
+    hidden = hidden_in(out, truth)
     cloud = Cloud.open(out / "cloud.zarr")
     pixels, shape = cloud.hsi_pixel, truth.hsi_class.shape
 

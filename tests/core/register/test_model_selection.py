@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,8 +22,7 @@ from specimap_core.register.tile_offsets import TileOffsets
 from specimap_core.report.model import Report
 from specimap_core.truth.judge import Judged, judge_with_sigma
 from tests.support.moved_specimen import CORNERS, LARGER
-from tests.support.reruns import codes, rerun
-from tests.support.scenes import Finished, OnDisk
+from tests.support.reruns import Reruns, codes
 
 ROWS, COLS = 256, 320
 SHARP_PX = 0.02
@@ -189,27 +187,22 @@ CUBES = {
 }
 
 
-def run_on(
-    cube: Cube, finished: Finished, small: OnDisk, folder: Path, hidden: tuple[int, ...] = ()
-) -> tuple[Report, Judged]:
-    changed = replace(LARGER, **cube.change)  # type: ignore[arg-type]
-    report = rerun(finished, small, folder, changed, hidden)
+def run_on(cube: Cube, reruns: Reruns, hidden: tuple[int, ...] = ()) -> tuple[Report, Judged]:
+    folder, report = reruns.on(replace(LARGER, **cube.change), hidden)  # type: ignore[arg-type]
     return report, judge_with_sigma(folder / "out", folder)
 
 
 @pytest.fixture(scope="module")
-def plain_mm(finished: Finished, small: OnDisk, tmp_path_factory: pytest.TempPathFactory) -> float:
+def plain_mm(reruns: Reruns) -> float:
     """The error with a frame camera of square pixels: the surface's own, most of it."""
-    return run_on(CUBES["square"], finished, small, tmp_path_factory.mktemp("plain"))[1].errors.median
+    return run_on(CUBES["square"], reruns)[1].errors.median
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CUBES)
-def test_a_cube_is_registered_by_a_camera_of_its_own_kind(
-    finished: Finished, small: OnDisk, tmp_path: Path, plain_mm: float, name: str
-) -> None:
+def test_a_cube_is_registered_by_a_camera_of_its_own_kind(reruns: Reruns, plain_mm: float, name: str) -> None:
     cube = CUBES[name]
-    report, judged = run_on(cube, finished, small, tmp_path)
+    report, judged = run_on(cube, reruns)
     assert codes(report) & OURS == cube.said
     assert report.cube_camera.model == cube.model
     assert report.cube_camera.pixel_aspect == pytest.approx(cube.aspect, abs=0.004)
@@ -221,10 +214,8 @@ def test_a_cube_is_registered_by_a_camera_of_its_own_kind(
 
 
 @pytest.mark.slow
-def test_two_markers_and_the_specimen_tell_a_scan(
-    finished: Finished, small: OnDisk, tmp_path: Path, plain_mm: float
-) -> None:
-    report, judged = run_on(CUBES["scan of rows"], finished, small, tmp_path, (1, 3))
+def test_two_markers_and_the_specimen_tell_a_scan(reruns: Reruns, plain_mm: float) -> None:
+    report, judged = run_on(CUBES["scan of rows"], reruns, (1, 3))
     assert report.marker_ids_in_cube == [0, 2]
     assert codes(report) & OURS <= {NOT_FRAME, "cube_camera_loose"}
     assert 0.02 < judged.errors.median < plain_mm + 0.06
@@ -232,9 +223,9 @@ def test_two_markers_and_the_specimen_tell_a_scan(
 
 
 @pytest.mark.slow
-def test_a_specimen_that_moved_in_a_scan_is_noticed(finished: Finished, small: OnDisk, tmp_path: Path) -> None:
+def test_a_specimen_that_moved_in_a_scan_is_noticed(reruns: Reruns) -> None:
     cube = Cube({"cube_scan": "rows", "moved_mm": (1.2, -0.9, 0.0)}, "scan_rows")
-    report, judged = run_on(cube, finished, small, tmp_path)
+    report, judged = run_on(cube, reruns)
     assert codes(report) & OURS >= {NOT_FRAME, "specimen_moved"}
     # Moved by 1.5 mm, and followed.
     assert 0.02 < judged.errors.median < 0.2
@@ -242,11 +233,9 @@ def test_a_specimen_that_moved_in_a_scan_is_noticed(finished: Finished, small: O
 
 
 @pytest.mark.slow
-def test_a_scan_that_wavers_is_no_motion_and_its_deviations_hold(
-    finished: Finished, small: OnDisk, tmp_path: Path
-) -> None:
+def test_a_scan_that_wavers_is_no_motion_and_its_deviations_hold(reruns: Reruns) -> None:
     cube = Cube({"cube_scan": "rows", "scan_wobble_mm": 0.3}, "scan_rows")
-    report, judged = run_on(cube, finished, small, tmp_path)
+    report, judged = run_on(cube, reruns)
     assert "cube_camera_unfit" in codes(report)
     assert "specimen_moved" not in codes(report)
     assert 0.1 < judged.errors.median < 0.5
@@ -255,8 +244,8 @@ def test_a_scan_that_wavers_is_no_motion_and_its_deviations_hold(
 
 
 @pytest.mark.slow
-def test_corners_of_a_cube_are_those_of_its_camera(finished: Finished, small: OnDisk, tmp_path: Path) -> None:
-    report, _ = run_on(CUBES["lines of 0.7"], finished, small, tmp_path)
+def test_corners_of_a_cube_are_those_of_its_camera(reruns: Reruns) -> None:
+    report, _ = run_on(CUBES["lines of 0.7"], reruns)
     assert report.cube_corners is not None
     residuals = np.array(report.cube_corners.residuals_px)
     assert 0.0 < np.sqrt((residuals**2).mean()) < 0.1

@@ -10,10 +10,12 @@ import pytest
 
 from specimap_core.cube import Cube, open_cube
 from specimap_core.geometry.cameras import Intrinsics, View
+from specimap_core.photos.folder import photo_paths
 from specimap_core.pipeline.artefacts import Stage2
-from specimap_core.pipeline.outputs import Inputs
-from specimap_core.pipeline.run import run_pipeline
+from specimap_core.pipeline.clock import Clock
+from specimap_core.pipeline.outputs import Outputs
 from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.pipeline.stages import adjust_stage, reconstruct_stage
 from specimap_core.register.corners import CornersInCube
 from specimap_core.register.cube_camera import solve_camera
 from specimap_core.register.cube_markers import find_markers
@@ -31,7 +33,7 @@ from tests.support.moved_specimen import (
     textured,
     turned,
 )
-from tests.support.scenes import Finished, bump_mesh, phantom_on_disk, shared_run
+from tests.support.scenes import Finished, OnDisk, bump_mesh, phantom_on_disk, shared_run
 from tests.support.shared_folders import SharedFolders
 
 
@@ -55,6 +57,15 @@ def shift_in(stage2: Stage2, cube: Cube) -> Shift | None:
 def cube_of(settings: PhantomSettings, folder: Path) -> Cube:
     write_cube(Phantom(settings).cube(), settings.wavelengths_nm, folder / "hsi.hdr", interleave="bsq")
     return open_cube(folder / "hsi.hdr")
+
+
+def surface_of(phantom: OnDisk, out: Path) -> Stage2:
+    """What the first two stages make of a phantom's photos."""
+    paths, settings, store = photo_paths(phantom.photos), PipelineSettings(), Outputs(out).store
+    out.mkdir()
+    clock = Clock(lambda stage, share: None, lambda: False)
+    stage1 = reconstruct_stage(paths, settings, store, "1", clock, 2)
+    return adjust_stage(stage1, settings, store, "2", clock, 2)
 
 
 # ---- phantoms, by their own reconstruction ------------------------------------------------------------
@@ -105,8 +116,7 @@ def test_a_still_specimen_is_left_in_peace(finished: Finished, tmp_path: Path, r
 def test_defects_are_not_taken_for_motion(tmp_path: Path, change: dict[str, object]) -> None:
     settings = replace(LARGER, photos=10, **change)  # type: ignore[arg-type]
     phantom = phantom_on_disk(tmp_path / "phantom", settings)
-    run_pipeline(Inputs(phantom.photos, phantom.header), tmp_path / "out", PipelineSettings())
-    stage2 = stage2_of(tmp_path / "out")
+    stage2 = surface_of(phantom, tmp_path / "out")
     still = shift_in(stage2, open_cube(phantom.header))
     assert still is None or not still.significant
     moved = shift_in(stage2, cube_of(replace(settings, moved_mm=(1.2, 1.6, 0.0)), tmp_path / "moved"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -29,6 +30,19 @@ def refined(scene: Matched, settings: RefineSettings = SETTINGS, worth: NDArray[
     )
 
 
+@cache
+def refined_whole(seed: int) -> Refined:
+    """All of a scene's mesh, refined once for the tests that look at it."""
+    return refined(matched(seed))
+
+
+@cache
+def refined_worth(seed: int) -> Refined:
+    """The part of a scene's mesh that is worth it, refined once for the tests that look at it."""
+    scene = matched(seed)
+    return refined(scene, worth=scene.worth)
+
+
 def tissue(scene: Matched) -> NDArray[np.bool_]:
     """Vertices of the specimen, the cards left out: these carry hard edges at 1 mm above the tray and less."""
     return np.asarray(scene.mesh.vertices[:, 2] > 1.0)
@@ -39,7 +53,7 @@ def test_each_pass_brings_the_surface_nearer_to_truth(seed: int) -> None:
     scene = matched(seed)
     of = tissue(scene)
     medians, tails = [], []
-    for mesh in (scene.mesh, refined(scene, FIRST).mesh, refined(scene).mesh):
+    for mesh in (scene.mesh, refined(scene, FIRST).mesh, refined_whole(seed).mesh):
         off = np.abs(scene.off_mm(mesh)[: len(of)][of])
         assert np.isfinite(off).mean() > 0.98
         medians.append(float(np.nanmedian(off)))
@@ -91,7 +105,7 @@ def test_new_vertices_lie_between_two_that_are_worth_it() -> None:
 
 def test_what_is_not_worth_it_changes_nothing_within_the_rest() -> None:
     scene = matched(SEEDS[0])
-    some, every = refined(scene, worth=scene.worth), refined(scene)
+    some, every = refined_worth(SEEDS[0]), refined_whole(SEEDS[0])
     inner = scene.mesh.vertices[:, 2] > 4.0
     both = slice(len(inner))
     apart = np.linalg.norm(some.mesh.vertices[both] - every.mesh.vertices[both], axis=1)[inner]
@@ -102,7 +116,7 @@ def test_what_is_not_worth_it_changes_nothing_within_the_rest() -> None:
 
 def test_views_and_how_they_agree_are_told() -> None:
     scene = matched(SEEDS[0])
-    after = refined(scene, worth=scene.worth)
+    after = refined_worth(SEEDS[0])
     count = len(scene.worth)
     views = after.views[:count][scene.worth]
     assert views.max() == min(SETTINGS.views, len(scene.images))
@@ -119,7 +133,7 @@ def test_views_and_how_they_agree_are_told() -> None:
 
 def test_places_where_agreement_is_sharp_are_the_better_ones() -> None:
     scene = matched(SEEDS[0])
-    after = refined(scene, worth=scene.worth)
+    after = refined_worth(SEEDS[0])
     of = tissue(scene)
     off, sharpness = np.abs(scene.off_mm(after.mesh)[: len(of)][of]), after.sharpness[: len(of)][of]
     low, high = np.percentile(sharpness, [25, 75])
@@ -155,12 +169,12 @@ def test_the_order_of_vertices_hardly_matters() -> None:
     m = scene.mesh
     mixed = Mesh(m.vertices[order], place[m.triangles].astype(np.int32), m.normals[order], m.colours[order])
     again = refine_mesh(mixed, scene.greys, scene.lens, scene.poses, scene.voxel_mm, SETTINGS, workers=1)
-    count = len(order)
-    apart = np.linalg.norm(again.mesh.vertices[:count][place] - refined(scene).mesh.vertices[:count], axis=1)
+    count, every = len(order), refined_whole(SEEDS[0])
+    apart = np.linalg.norm(again.mesh.vertices[:count][place] - every.mesh.vertices[:count], axis=1)
     # Sums in another order differ in their last bits, which an interpolation in steps of 1/32 pixel makes larger, and
     # where two offsets are nearly as good, the other one may win: rarely, and by less than is stated of the place.
     assert np.median(apart) < LEAST_SIGMA_MM / 5
-    stated = mesh_sigma(refined(scene), scene.maps, scene.poses)[:count]
+    stated = mesh_sigma(every, scene.maps, scene.poses)[:count]
     assert (apart < stated).mean() > 0.99
 
 

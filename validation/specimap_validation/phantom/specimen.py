@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from specimap_core.arrays import Floats
+from specimap_core.arrays import Floats, Singles
 from specimap_core.geometry.cameras import Pose, rotation_from_vector
 from specimap_validation.phantom import materials
 from specimap_validation.phantom.noise import NoiseVolume, smoothstep
@@ -32,26 +32,39 @@ class Specimen:
 def build_specimen(settings: PhantomSettings) -> Specimen:
     """Build a lumpy ellipsoid cut flat at the tray, wider above its base (undercut), of the stated extents."""
     rng = settings.rng(Stream.SHAPE)
-    directions, triangles = cube_sphere(settings.mesh_divisions)
-    size = np.array(settings.specimen_mm)
-    # The ellipsoid is cut below its equator: the flank overhangs the base by a small undercut.
-    axes = np.array([size[0] / 2, size[1] / 2, size[2] / 1.55])
-    base = directions * axes
-    outward = directions / axes
-    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-
+    axes, base, outward, triangles = ellipsoid(settings)
+    # A double, since noise is single: a plain number would leave the product single.
+    tall = np.float64(settings.specimen_mm[2])
     lumps = NoiseVolume(rng, 9.0, 30.0, slope=1.5)
     wrinkles = NoiseVolume(rng, 1.3, 5.0, slope=1.2)
     regions = NoiseVolume(rng, 7.0, 25.0)
-    first, second = lobule_distances(rng, base, axes)
-    crease = smoothstep(0.0, 0.9, second - first)
-    fat = smoothstep(-0.25, 0.25, regions(base) + 0.15)
-
-    displacement = 0.09 * size[2] * lumps(base) + fat * (0.55 * crease - 0.3) + 0.13 * wrinkles(base)
+    crease, fat = lobules(rng, base, axes, regions(base))
+    displacement = 0.09 * tall * lumps(base) + fat * (0.55 * crease - 0.3) + 0.13 * wrinkles(base)
     vertices = base + outward * displacement[:, None]
     vertices = rest_on_tray(vertices, settings)
     normals = vertex_normals(vertices, triangles)
     return Specimen(vertices, triangles, normals, tissue_of(rng, base, axes, fat, crease))
+
+
+def ellipsoid(settings: PhantomSettings) -> tuple[Floats, Floats, Floats, NDArray[np.int32]]:
+    """Half axes (3,) mm of what a specimen is shaped from, its surface (V, 3) mm, the surface's normals (V, 3) and
+    triangles (T, 3)."""
+    directions, triangles = cube_sphere(settings.mesh_divisions)
+    size = np.array(settings.specimen_mm)
+    # The ellipsoid is cut below its equator: the flank overhangs the base by a small undercut.
+    axes = np.array([size[0] / 2, size[1] / 2, size[2] / 1.55])
+    outward = directions / axes
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    return axes, directions * axes, outward, triangles
+
+
+def lobules(rng: np.random.Generator, base: Floats, axes: Floats, regions: Singles) -> tuple[Floats, Floats]:
+    """How far each place (V, 3) is from the creases between lobules, and how fatty it is, (V,) from 0 to 1.
+
+    ``regions`` (V,): noise that divides fatty from other tissue.
+    """
+    first, second = lobule_distances(rng, base, axes)
+    return smoothstep(0.0, 0.9, second - first), smoothstep(-0.25, 0.25, regions + 0.15)
 
 
 def displacement(settings: PhantomSettings) -> Pose:
