@@ -75,9 +75,9 @@ def subdivided(triangles: NDArray[np.int32], finer: NDArray[np.bool_]) -> tuple[
     split = finer[ends].all(1)
     ends = np.sort(ends, axis=1)
     keys, number = np.unique(ends[split, 0] * n + ends[split, 1], return_inverse=True)
-    middle = np.full(len(ends), -1, np.int64)
-    middle[split] = n + number
-    middle = middle.reshape(-1, 3)
+    new = np.full(len(ends), -1, np.int64)
+    new[split] = n + number
+    middle = new.reshape(-1, 3)
     # Three ends that are finer split all three edges, two split the one between them.
     whole, one = (middle >= 0).all(1), (middle >= 0).sum(1) == 1
     corners, between = triangles[whole], middle[whole]
@@ -86,6 +86,6 @@ def subdivided(triangles: NDArray[np.int32], finer: NDArray[np.bool_]) -> tuple[
     k = (middle[one] >= 0).argmax(1)
     rows = np.arange(len(k))
     first, second, third = (triangles[one][rows, (k + j) % 3] for j in range(3))
-    new = middle[one][rows, k]
-    parts += [np.stack([first, new, third], 1), np.stack([new, second, third], 1)]
+    added = middle[one][rows, k]
+    parts += [np.stack([first, added, third], 1), np.stack([added, second, third], 1)]
     return np.concatenate(parts).astype(np.int32), np.stack([keys // n, keys % n], 1)
