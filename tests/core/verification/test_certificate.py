@@ -84,7 +84,7 @@ def checked(out: Path, *, focal: float = 1.0, lifted_mm: float = 0.0, turned: tu
     stage1, stage2 = _stages(out)
     adjusted, mesh = stage2.adjusted, stage2.mesh
     lens = replace(adjusted.lens, focal_px=adjusted.lens.focal_px * focal)
-    aside = Pose(rotation_from_vector(np.array([0.0, 0.006, 0.0])), np.zeros(3))
+    aside = Pose(rotation_from_vector(np.array([0.0, 0.0015, 0.0])), np.zeros(3))
     poses = tuple(aside @ p if k in turned else p for k, p in enumerate(adjusted.poses))
     raised = np.flatnonzero((mesh.vertices[:, 2] > raised_mm(adjusted.corners)) & (mesh.normals[:, 2] > 0.5))
     chosen = raised[:: max(1, len(raised) // 150)]
