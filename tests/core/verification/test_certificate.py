@@ -29,7 +29,7 @@ from specimap_core.verification.sites import Sites, visible
 from specimap_core.verification.surface_check import check_surface
 from specimap_validation.phantom import PhantomSettings
 from tests.support.moved_specimen import stage2_of
-from tests.support.scenes import Finished, OnDisk, cube_with, shared_phantom, shared_run
+from tests.support.scenes import Finished, cube_with, shared_phantom, shared_run
 from tests.support.shared_folders import SharedFolders
 
 MEDIUM: dict[str, Any] = {
@@ -126,15 +126,17 @@ def test_a_wrong_lens_and_wrong_poses_are_called(sharp: Finished) -> None:
     assert turned.photo_shift_px > MOST_PHOTO_SHIFT_PX
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shift", [0.0, 0.4])
-def test_bands_that_lie_apart_are_measured(small: OnDisk, tmp_path: Path, shift: float) -> None:
-    values = small.values()
+def test_bands_that_lie_apart_are_measured(shared_folders: SharedFolders, tmp_path: Path, shift: float) -> None:
+    phantom = shared_phantom(shared_folders, SHARP)
+    values = phantom.values()
     for band in range(values.shape[2] if shift else 0):
         move = np.array([[1, 0, shift * band / (values.shape[2] - 1)], [0, 1, 0]])
         size = values.shape[1::-1]
         values[..., band] = cv2.warpAffine(values[..., band], move, size, borderMode=cv2.BORDER_REPLICATE)
-    cube = open_cube(cube_with(values, small, tmp_path))
-    corners = small.truth.hsi_view.project(small.truth.marker_corners)
+    cube = open_cube(cube_with(values, phantom, tmp_path))
+    corners = phantom.truth.hsi_view.project(phantom.truth.marker_corners)
     found = check_bands(cube, corners)
     assert found is not None
     assert found.sigma_px > 0
