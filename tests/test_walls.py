@@ -32,7 +32,7 @@ MAY_IMPORT = {
 CORE_ORDER = (
     *("errors", "arrays", "notices", "threads", "progress", "json_text", "atomic", "native"),
     *("geometry", "sandbox", "photos", "fiducials", "cube"),
-    *("bundle_adjust", "surface", "render", "cloud", "reconstruct", "register"),
+    *("bundle_adjust", "surface", "render", "cloud", "reconstruct", "register", "verification"),
     *("truth", "report", "export", "screening", "pipeline"),
 )
 """Modules and packages of core: each imports those before it alone."""

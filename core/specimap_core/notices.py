@@ -110,6 +110,13 @@ CATALOGUE = MappingProxyType(
             "result", "in some photos the markers' corners lie far more off than in the others"
         ),
         "cube_corners_scatter": NoticeKind("result", "the cube's corners lie far from where its camera puts them"),
+        "photos_contradict": NoticeKind("result", "photos show the specimen elsewhere than the other photos predict"),
+        "photos_unpredicted": NoticeKind("result", "most of the photos do not resemble what the others predict"),
+        "surface_leans": NoticeKind("result", "unused photos show the whole surface higher or lower"),
+        "surface_unchecked": NoticeKind("result", "too few photos were left to check the surface with"),
+        "seen_error_large": NoticeKind("result", "unused photos and the cube's picture show large errors"),
+        "cube_picture_off": NoticeKind("result", "the cube's picture lies off the photos' colours"),
+        "bands_shifted": NoticeKind("result", "the cube's bands are shifted or stretched against each other"),
     }
 )
 """Every code with its origin and meaning; :mod:`specimap_core.report.wording` holds the advice on each."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from specimap_core.register.figures import Quartiles, Spread
-from specimap_validation.runs import AgainstTruth, Figures, Outcome, Refusal
+from specimap_validation.runs import AgainstTruth, Certified, Figures, Outcome, Refusal
 
 
 def outcome(level: float, *, truth: bool = True) -> Outcome:
@@ -27,6 +27,7 @@ def outcome(level: float, *, truth: bool = True) -> Outcome:
             )
             if truth
             else None,
+            certified=Certified(verdict="trusted", seen_median_mm=level * 2, seen_p95_mm=level * 8),
         ),
         refusal=None,
     )

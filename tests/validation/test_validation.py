@@ -82,6 +82,8 @@ def test_a_real_validation_of_one_phantom(tmp_path: Path, monkeypatch: pytest.Mo
     assert 0.01 < ours.truth.median_mm < 0.3 < published.truth.median_mm < 1.5
     assert 0.001 < published.corner_2d_mm.mean < 0.05
     assert published.seconds > 0
+    assert ours.certified is not None
+    assert ours.certified.verdict == "trusted"
     assert events[-1]["event"] == "finished"
     assert {Path(f).name for f in events[-1]["files"]} > {"validation.html", "validation.md", "page.md"}
     assert not [p for p in out.iterdir() if p.is_dir()]
@@ -210,11 +212,13 @@ def test_tables_pool_seeds_and_show_the_worst(tmp_path: Path) -> None:
     assert none["true error mm: p95"] == "0.27 [0.63]"
     assert none["scale"] == "-0.10 %"
     assert none["within 1, 2 sigma"] == "70 %, 95 %"
+    assert none["certificate, mm seen"] == "trusted, 0.060 [0.140]"
     # A moved specimen is no fault of a registration: it stays out of the comparison of the forms.
     assert [line[1] for line in by_form.rows] == [f"{m}, {a}" for m, a in VARIANTS]
     assert all("0.210" in line[5] and "1.500" not in line[5] for line in by_form.rows)
     text = markdown(validation)
     assert "seeds 1, 2, 3" in text
+    assert "rank 4 runs as the true medians do: Spearman 1.00" in text
     assert text.count("\n|---|") == 2
     written = publish_validation(validation, tmp_path)
     assert len(written) == 8

@@ -29,6 +29,7 @@ from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.register.figures import Quartiles, Section, Spread
 from specimap_core.report.model import Report
 from specimap_core.truth.judge import judge_with_sigma
+from specimap_core.verification.figures import Verdict
 
 REFUSED = (
     TooFewPhotosError,
@@ -57,8 +58,30 @@ class AgainstTruth(Section):
     within_2_sigma: float
 
 
+class Certified(Section):
+    """What a run's certificate says without any truth: its verdict, and the errors seen, mm, None where it saw none."""
+
+    verdict: Verdict
+    seen_median_mm: float | None
+    seen_p95_mm: float | None
+
+    @staticmethod
+    def of(report: Report) -> Certified | None:
+        """Of the report; None where it has no certificate."""
+        found = report.certificate
+        if found is None:
+            return None
+        total = found.total_mm
+        return Certified(
+            verdict=found.verdict,
+            seen_median_mm=None if total is None else total.median,
+            seen_p95_mm=None if total is None else total.p95,
+        )
+
+
 class Figures(Section):
-    """Figures of a run's report, and its errors against truth where that is known."""
+    """Figures of a run's report, and its errors against truth where that is known; ``certified`` is None in outcomes of
+    versions that made no certificate."""
 
     photos_given: int
     photos_used: int
@@ -68,6 +91,7 @@ class Figures(Section):
     seconds: float
     warnings: list[str]
     truth: AgainstTruth | None
+    certified: Certified | None = None
 
 
 class Refusal(Section):
@@ -117,6 +141,7 @@ def figures_of(report: Report, out: Path, truth: Path | None) -> Figures:
         seconds=round(sum(report.seconds.values()), 2),
         warnings=[w.code for w in report.warnings],
         truth=None if truth is None else _judge_against(out, truth),
+        certified=Certified.of(report),
     )
 
 

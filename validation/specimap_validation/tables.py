@@ -15,6 +15,8 @@ from specimap_validation.runs import Figures
 from specimap_validation.subsampling import Row as StudyRow
 
 NOTHING = "-"
+LEAST_RANKED = 3
+VERDICTS = ("trusted", "doubtful", "not_trusted")
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,7 @@ VALIDATION_HEADINGS = (
     "scale",
     "coverage",
     "within 1, 2 sigma",
+    "certificate, mm seen",
     "warnings",
 )
 
@@ -100,7 +103,7 @@ def pooled_cells(name: str, rows: Sequence[v.Row]) -> tuple[str, ...]:
     refused = [f"{code} ({counts[code]} of {len(rows)})" for code in sorted(counts)]
     label = f"{name}, refused: {', '.join(refused)}" if refused else name
     if not found:
-        return (label, f"{method}, {form}", *(NOTHING,) * 9)
+        return (label, f"{method}, {form}", *(NOTHING,) * 10)
     means = np.array([f.corner_2d_mm.mean for f in found])
     spread = float(np.sqrt(np.mean([f.corner_2d_mm.std**2 for f in found]) + means.var()))
     corners_3d = [f.corner_3d_mm for f in found if f.corner_3d_mm is not None]
@@ -119,8 +122,18 @@ def pooled_cells(name: str, rows: Sequence[v.Row]) -> tuple[str, ...]:
         f"{100 * scale:+.2f} %" if truth else NOTHING,
         f"{100 * min(t.coverage for t in truth):.1f} %" if truth else NOTHING,
         f"{_percent([t.within_1_sigma for t in truth])}, {_percent([t.within_2_sigma for t in truth])}",
+        _certified(found),
         _warnings(found),
     )
+
+
+def _certified(found: Sequence[Figures]) -> str:
+    known = [f.certified for f in found if f.certified is not None]
+    if not known:
+        return NOTHING
+    seen = [c.seen_median_mm for c in known if c.seen_median_mm is not None]
+    worst = max((c.verdict for c in known), key=VERDICTS.index)
+    return f"{worst.replace('_', ' ')}, {_with_worst(seen, 3) or NOTHING}"
 
 
 def _warnings(found: Sequence[Figures]) -> str:
@@ -142,7 +155,7 @@ def _with_worst(values: Sequence[float], digits: int) -> str:
 def _published_cells() -> tuple[str, ...]:
     corners_2d = ", ".join(f"{mean:.3f} ± {sd:.3f}" for mean, sd in published.CORNER_2D_MM)
     corners_3d = ", ".join(f"{median:.3f}" for median in published.CORNER_3D_MM)
-    return (f"{published.REFERENCE}, two specimens", "homography, free", corners_2d, corners_3d, *(NOTHING,) * 7)
+    return (f"{published.REFERENCE}, two specimens", "homography, free", corners_2d, corners_3d, *(NOTHING,) * 8)
 
 
 def validation_tables(validation: v.Validation) -> list[Table]:
@@ -170,12 +183,35 @@ def _of(rows: Sequence[v.Row], variant: tuple[str, str], defect: str | None = No
     return [r for r in rows if (r.method, r.adjustment) == variant and defect in (None, r.defect)]
 
 
+def certificate_rank(validation: v.Validation) -> tuple[float, int] | None:
+    """Spearman's correlation of the errors that the certificates of the default form saw with the true medians, and of
+    how many runs; None for fewer than three."""
+    pairs = [
+        (found.certified.seen_median_mm, found.truth.median_mm)
+        for row in validation.rows
+        if (row.method, row.adjustment) == v.DEFAULT
+        and (found := row.outcome.figures) is not None
+        and found.truth is not None
+        and found.certified is not None
+        and found.certified.seen_median_mm is not None
+    ]
+    if len(pairs) < LEAST_RANKED:
+        return None
+    # Loaded here: studies of one acquisition need no statistics.
+    from scipy.stats import spearmanr
+
+    return float(spearmanr(*zip(*pairs, strict=True)).statistic), len(pairs)
+
+
 def in_words(validation: v.Validation) -> str:
     """Describe the basis of the tables in a sentence or two."""
     seeds = sorted({row.seed for row in validation.rows if row.seed is not None})
     size = "quick, on small phantoms" if validation.quick else "on phantoms of full size"
+    rank = certificate_rank(validation)
+    ranked = f" The errors seen rank {rank[1]} runs as the true medians do: Spearman {rank[0]:.2f}." if rank else ""
     return (
         f"Specimap {validation.specimap_version}, {size}, seeds {', '.join(map(str, seeds)) or NOTHING}. Corner "
         "figures are means over the seeds, true errors medians over the seeds with the worst seed in brackets, "
-        "scale the worst, coverage the least."
+        "scale the worst, coverage the least; the certificate's worst verdict, and the error that it sees as a median."
+        f"{ranked}"
     )

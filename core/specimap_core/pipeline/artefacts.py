@@ -24,8 +24,8 @@ from specimap_core.surface.fusion import Mesh
 
 DEPTH_STEPS = 65534
 GRIDS = ("coarse", "fine")
-IMAGES = ("depth_", "colour_", "confidence_", "turn_", "greys")
-"""Arrays of stage 1 that stage 2 alone needs: hundreds of megabytes."""
+IMAGES = ("depth_", "colour_", "confidence_", "turn_")
+"""Arrays of stage 1 that stage 2 alone needs: hundreds of megabytes. Stage 4 checks its result on the greys."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,8 @@ class Stage1:
     sheet: bytes = b""
 
     def without_depth(self) -> Stage1:
-        """The same without depth maps and images, for what comes after the mesh."""
-        return replace(self, reconstruction=replace(self.reconstruction, maps=()), greys=())
+        """The same without depth maps, for what comes after the mesh."""
+        return replace(self, reconstruction=replace(self.reconstruction, maps=()))
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def save_stage1(store: Store, key: str, stage: Stage1) -> None:
 
 
 def load_stage1(store: Store, key: str, *, with_depth: bool = True) -> Stage1 | None:
-    """The artefact of :func:`save_stage1`; without depth maps and images where only what follows needs it."""
+    """The artefact of :func:`save_stage1`; without depth maps where only what follows needs it."""
     found = store.load("reconstruct", key, () if with_depth else IMAGES)
     if found is None:
         return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,13 +22,15 @@ from specimap_core.pipeline.outputs import Outputs, staged
 from specimap_core.pipeline.report_builder import RunRecord, build_report
 from specimap_core.pipeline.run_warnings import with_assumptions
 from specimap_core.pipeline.settings import PipelineSettings
+from specimap_core.progress import within
 from specimap_core.register.registration import Surface, register_cube
 from specimap_core.report.model import Report
 from specimap_core.report.quality_gates import gated
 from specimap_core.surface.mesh_files import write_mesh_ply
+from specimap_core.verification.certificate import Evidence, gather
 
-REGISTERED_SHARE, CLOUD_SHARE = 0.4, 0.5
-"""Shares of the stage's progress: the registration, and the writing of the cloud."""
+REGISTERED_SHARE, CHECKED_SHARE, CLOUD_SHARE = 0.35, 0.15, 0.4
+"""Shares of the stage's progress: the registration, its check, and the writing of the cloud."""
 
 
 @dataclass(frozen=True)
@@ -62,9 +64,13 @@ def register_stage(
             )
         except MarkersMissingInCubeError as error:
             raise with_assumptions(error, cube.warnings) from error
+        checked = REGISTERED_SHARE + CHECKED_SHARE
+        evidence = gather(registered, stage1.greys, cube, settings.refine, within(progress, REGISTERED_SHARE, checked))
+        registered = replace(registered, points=evidence.scaled(registered.points))
         adjusted = registered.surface.adjusted
         run = RunRecord(settings, given.hashes, clock.seconds, clock.reused, given.warnings)
         report = gated(build_report(stage1, adjusted, registered, run), settings.adjust.edge_mm)
+        report = certified(report, evidence)
 
         def attributes(written: WriteSummary) -> dict[str, object]:
             nonlocal report
@@ -80,7 +86,7 @@ def register_stage(
                 registered.points,
                 cube,
                 attributes,
-                progress=lambda share: progress(REGISTERED_SHARE + CLOUD_SHARE * share),
+                progress=lambda share: progress(checked + CLOUD_SHARE * share),
             )
             write_preview(Cloud.open(aside.cloud), aside.preview)
             if stage1.sheet:
@@ -88,3 +94,10 @@ def register_stage(
             report = report.model_copy(update={"seconds": clock.so_far()})
             write_text(aside.report, report.text())
     return report
+
+
+def certified(report: Report, evidence: Evidence) -> Report:
+    """The report with its certificate and the warnings that this calls for."""
+    warnings = [*report.warnings, *evidence.warnings()]
+    certificate = evidence.certificate({w.code for w in warnings})
+    return report.model_copy(update={"warnings": warnings, "certificate": certificate})

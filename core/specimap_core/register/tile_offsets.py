@@ -62,13 +62,19 @@ class TileOffsets:
 
 
 def measure_tile_offsets(
-    image: NDArray[np.float32], view: View, caster: RayCaster, corners: Floats, *, mirrored: bool = False
+    image: NDArray[np.float32],
+    view: View,
+    caster: RayCaster,
+    corners: Floats,
+    *,
+    mirrored: bool = False,
+    reach_mm: float = REACH_MM,
 ) -> TileOffsets | None:
     """Measure the tiles' offsets; None where there is none, it has no texture, or the tiles' places contradict.
 
     ``image`` (rows, cols): a linear image of the cube in its own columns, such as its band mean, NaN where unknown;
     ``view``: the cube's solved camera; ``corners`` (Q, 4, 3) mm of the markers; ``mirrored``: the cube's columns run
-    the wrong way round.
+    the wrong way round; ``reach_mm``: longest shift looked for.
     """
     seen = image[:, ::-1] if mirrored else image
     spans = view.mm_per_px(float(view.cam_from_world.apply(corners.reshape(-1, 3))[:, 2].mean()))
@@ -85,7 +91,7 @@ def measure_tile_offsets(
     grey = _log_image(seen, float(scale[0]), float(scale[1]))
     known = channels[-1] > 0
     detail = np.stack([_detail(c, known, px) for c in channels[:-1]])
-    tiles = Tiles.of(specimen, TILE_MM / px, REACH_MM / px)
+    tiles = Tiles.of(specimen, TILE_MM / px, reach_mm / px)
     if tiles is None:
         return None
     scores = tiles.scores(detail, _detail(grey, np.ones(grey.shape, bool), px), box)

@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from specimap_core.register.figures import LeaveOneOut, MethodFigures
 from specimap_core.report import published
 from specimap_core.report.blocks import Block, Bullets, Callout, Document, Level, Paragraph, Section, Table
+from specimap_core.report.certificate_blocks import certificate_blocks
 from specimap_core.report.illustrations import (
     corner_blocks,
     coverage_blocks,
@@ -52,6 +53,9 @@ def compose(material: Material) -> Document:
         Section("verdict", "Verdict", tuple(_verdict(report, material.errors))),
         Section("figures", "Accuracy at the markers", tuple(_figures(report))),
     ]
+    if report.certificate is not None:
+        checked = tuple(certificate_blocks(report.certificate))
+        sections.append(Section("certificate", "Checked against unused evidence", checked))
     if material.errors is not None:
         sections.append(Section("truth", "Accuracy against truth", tuple(truth_blocks(material))))
     sections += [

@@ -11,6 +11,7 @@ from specimap_core.errors import NotFoundError
 from specimap_core.json_text import json_ready, json_text
 from specimap_core.notices import Notice
 from specimap_core.register.figures import Figure, LeaveOneOut, MethodFigures, Quartiles, Section, Spread
+from specimap_core.verification.figures import Certificate
 
 
 class EdgeLength(Section):
@@ -152,6 +153,8 @@ class Report(Section):
     photo_corners: list[PhotoCorners] | None = None
     """Of each used photo, in the order of ``photos.used``; None in reports of versions that did not keep them."""
     cube_corners: CubeCorners | None = None
+    certificate: Certificate | None = None
+    """Check against evidence that was not used; None in reports of versions that made none."""
 
     def summary(self) -> dict[str, object]:
         """As JSON values, without what report.json alone holds: readers of a cloud fetch its attributes first."""

@@ -78,6 +78,13 @@ WARNING_ADVICE = {
     "corners_scatter": "Take all photos again, touching neither markers nor specimen in between, with one lens.",
     "photo_outlying": "Look at the photos that are named: a card moved, or another lens. Take them again.",
     "cube_corners_scatter": "Record the cube again: all markers unmoved, sharp, and the sensor's pixels square.",
+    "photos_contradict": "Take all photos again, touching neither specimen nor markers, with one lens and fixed focus.",
+    "photos_unpredicted": "Take the photos again, sharp, evenly lit and without glare; then repeat the run.",
+    "surface_leans": "Take all photos again with one lens and fixed focus; check the edge of the markers.",
+    "surface_unchecked": f"Take {RECOMMENDED_PHOTOS} or more photos from all around: some must be left for checking.",
+    "seen_error_large": "Take more and sharper photos, evenly lit; rely on no place more closely than sigma_mm says.",
+    "cube_picture_off": "Check the preview against the specimen; if in doubt, photograph and record again, untouched.",
+    "bands_shifted": "Have the camera's software register the bands, or compare spectra over several pixels only.",
     "files_passed_over": "Nothing, where none of them is a photo of this specimen; else put it beside the others.",
     "licence_apache": "Nothing: the licence allows any use.",
     "licence_non_commercial": "Use this result for no commercial purpose; run the default backend for any other.",
@@ -102,6 +109,11 @@ GRAVE = (
     "specimen_not_found",
     "corners_scatter",
     "cube_corners_scatter",
+    "photos_contradict",
+    "photos_unpredicted",
+    "surface_leans",
+    "seen_error_large",
+    "cube_picture_off",
 )
 """Warnings that put all places in doubt."""
 UNKNOWN_REFUSAL_ADVICE = "Take it again from the same side with the markers in view."

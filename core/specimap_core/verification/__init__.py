@@ -1,0 +1,1 @@
+"""Check of a finished result against evidence that was not used to make it."""
