@@ -26,6 +26,8 @@ OBLIQUE = 1.5
 IMAGE_MARGIN_PX = 6
 SPARE_BEFORE_HIDDEN = 3
 """Candidates beyond those wanted, since some will be hidden."""
+CHECKING = 5
+"""Every so many-th photo that sees a place is left out of the comparison, to check the result with."""
 SPARE_BEFORE_HIGHLIGHTS = 4
 """Views looked at beyond those wanted, so that highlights can be left out."""
 HIGHLIGHT = 1.04
@@ -94,12 +96,14 @@ def choose_views(
     mesh: Mesh, chosen: Ints, photographs: Photographs, most: int, least_cosine: float, *, workers: int = 1
 ) -> Ints:
     """For each of the ``chosen`` (n,) vertices the photos that are compared there, (n, most), -1 where there are fewer:
-    those that see it most squarely and unhidden, and not in a highlight.
+    those that see it most squarely and unhidden, and not in a highlight. Every fifth of them is left out, so that the
+    result can be checked with photos that did not make it.
 
     Highlights move over the surface with the camera and lie where the lamp's mirror image is, below it: photos that
     agree on them agree on a wrong place.
     """
-    views = np.empty((len(chosen), most + SPARE_BEFORE_HIGHLIGHTS), np.int64)
+    looked_at = most + (most - 1) // (CHECKING - 1) + SPARE_BEFORE_HIGHLIGHTS
+    views = np.empty((len(chosen), looked_at), np.int64)
     caster = RayCaster(mesh)
 
     def run(part: slice) -> None:
@@ -108,8 +112,8 @@ def choose_views(
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(run, [slice(k, k + CHUNK) for k in range(0, len(chosen), CHUNK)]))
     views[_highlights(mesh.vertices[chosen].astype(float), views, photographs)] = -1
-    order = np.argsort(views < 0, axis=1, kind="stable")[:, :most]
-    return np.take_along_axis(views, order, 1)
+    packed = np.take_along_axis(views, np.argsort(views < 0, axis=1, kind="stable"), 1)
+    return np.delete(packed, np.s_[CHECKING - 1 :: CHECKING], axis=1)[:, :most]
 
 
 def _most_frontal(caster: RayCaster, chosen: Ints, photographs: Photographs, most: int, least_cosine: float) -> Ints:

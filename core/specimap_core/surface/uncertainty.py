@@ -54,9 +54,9 @@ class Shares:
     which a sideways error turns into height.
     """
 
-    of_width: float = 0.0543
-    of_bend: float = 0.87
-    of_jump: float = 0.416
+    of_width: float = 0.1463
+    of_bend: float = 0.8491
+    of_jump: float = 0.4083
 
 
 SHARES = Shares()

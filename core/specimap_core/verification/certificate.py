@@ -141,7 +141,7 @@ def gather(
     """Check a registered result against the ``greys`` (H, W) of its photos and against the cube."""
     surface, camera, markers = registered.surface, registered.camera, registered.markers
     adjusted, caster = surface.adjusted, surface.caster
-    photographs = Photographs([g.astype(np.float32) for g in greys], adjusted.lens, adjusted.poses[: len(greys)])
+    photographs = Photographs(list(greys), adjusted.lens, adjusted.poses[: len(greys)])
     sites = sites_of(registered.points, caster, photographs, settings)
     progress(0.3)
     of_surface = _checked_surface(sites, photographs, caster)

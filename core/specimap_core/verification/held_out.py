@@ -79,7 +79,7 @@ class _Patches:
         for v, grey in enumerate(photographs.greys):
             of = slice(self.first[v], self.first[v + 1])
             if of.stop > of.start:
-                values[of] = sample(grey, self.x[of] + moved[of, :1], self.y[of] + moved[of, 1:])
+                values[of] = sample(grey.astype(np.float32), self.x[of] + moved[of, :1], self.y[of] + moved[of, 1:])
         return values
 
     def only(self, chosen: Ints) -> _Patches:

@@ -41,7 +41,7 @@ def sites_of(points: CloudPoints, caster: RayCaster, photographs: Photographs, s
     seen = visible(place, normal, photographs, caster, settings.least_cosine)
     used = np.zeros_like(seen)
     if len(vertices):
-        views = choose_views(mesh, vertices, photographs, settings.passes[0].views, settings.least_cosine)
+        views = choose_views(mesh, vertices, photographs, settings.views, settings.least_cosine)
         site, rank = np.nonzero(views >= 0)
         used[site, views[site, rank]] = True
     return Sites(place, normal, used & seen, seen, sigma)
