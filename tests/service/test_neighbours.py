@@ -165,7 +165,7 @@ def test_a_file_whose_client_went_away_while_it_waited_is_not_judged(beside: Run
     with asking(lambda k: send(client, acquisition, "photo", "x.png", b"HOLD"), 1) as uploads:
         try:
             until(lambda: len(list(started.iterdir())) == 1, 20, "the file that is judged")
-            for ask in (
+            asks: list[Callable[[], httpx.Response]] = [
                 lambda: client.patch(place, content=b"HOLD", headers=headers, timeout=impatient),
                 lambda: client.get(f"{place}/result", timeout=impatient),
                 lambda: client.head(place, headers=TUS, timeout=impatient),
@@ -175,7 +175,8 @@ def test_a_file_whose_client_went_away_while_it_waited_is_not_judged(beside: Run
                     files={"file": ("y.png", b"HOLD")},
                     timeout=impatient,
                 ),
-            ):
+            ]
+            for ask in asks:
                 with pytest.raises(httpx.ReadTimeout):
                     ask()
                 until(lambda: intake.waiting == 0, 10, "the end of the wait")
