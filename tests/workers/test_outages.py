@@ -32,7 +32,7 @@ pytestmark = pytest.mark.slow
 
 LONG = os.environ.get("SPECIMAP_TEST_OUTAGE_SECONDS")
 SECONDS = dict.fromkeys(("shut", "hang"), float(LONG)) if LONG else {"shut": 4.0, "hang": 14.0}
-"""Length of an outage: a hanging server is given up after twelve. The variable sets another one, as for a trial of it."""
+"""Length of an outage: a hanging server is given up after twelve. The variable sets another one."""
 
 
 @dataclass(frozen=True)
