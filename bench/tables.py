@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from bench.faults.sheet import newest_of_each, sheet_faults
 from bench.features import sheet_features
 from bench.growth import sheet_growth
 from bench.machine import in_words
@@ -34,11 +35,12 @@ OF_RUNS: dict[str, Callable[[dict[str, Any]], list[Sheet]]] = {
     "growth": sheet_growth,
 }
 """Parts of ``python -m bench`` whose tables stand in docs/performance-tables.md."""
+FAULTS = "faults"
 MARKS: dict[Path, tuple[str, ...]] = {
     README: ("accuracy",),
     ACCURACY: ("accuracy", REAL, "sigma", "budget"),
     BACKENDS: ("features",),
-    PERFORMANCE: (*OF_RUNS, *PARTS),
+    PERFORMANCE: (*OF_RUNS, *PARTS, FAULTS),
 }
 """The marks that each page holds."""
 
@@ -114,6 +116,13 @@ def run_tables(part: str, record: dict[str, Any]) -> str:
     return "\n\n".join([*tables, f"{in_words(machine)}, {figures['load_after']} after; {record['time'][:10]}."])
 
 
+def faults_table() -> str:
+    """Jobs while processes are killed: the newest record of each kind of run, and what it was measured on."""
+    records = newest_of_each(json.loads(path.read_text("utf-8")) for path in sorted(RESULTS.glob(f"*-{FAULTS}.json")))
+    places = {f"{in_words(record['machine'])}; {record['time'][:10]}." for record in records}
+    return "\n\n".join([sheet_faults([record["figures"] for record in records]).markdown(), *sorted(places)])
+
+
 def main() -> None:
     """Fill the pages."""
     figures = newest("accuracy")
@@ -128,6 +137,7 @@ def main() -> None:
         put(PERFORMANCE, part, run_tables(part, newest_record(part)))
     for part in PARTS:
         put(PERFORMANCE, part, in_markdown(part, newest_record(f"service-{part}")))
+    put(PERFORMANCE, FAULTS, faults_table())
 
 
 if __name__ == "__main__":

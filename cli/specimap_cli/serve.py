@@ -34,7 +34,7 @@ def serve(*, workers: bool, say: Callable[[str], None]) -> None:
     import uvicorn
 
     from specimap_service.app import create_app
-    from specimap_service.server import notice_dead_peers, server_config
+    from specimap_service.server import keep_collections_short, notice_dead_peers, server_config
 
     settings = load_settings()
     set_up_logs(settings)
@@ -59,6 +59,7 @@ def serve(*, workers: bool, say: Callable[[str], None]) -> None:
     class Server(uvicorn.Server):
         async def startup(self, sockets: list[socket.socket] | None = None) -> None:
             await super().startup(sockets)
+            keep_collections_short()
             say(f"Specimap listens on {url}")
             say(f"The API is described at {url}/docs")
             if key:

@@ -22,7 +22,7 @@ def _storage() -> None:
 @storage_app.command()
 def check(
     repair: Annotated[
-        bool, typer.Option("--repair", help="Remove files that no row refers to, and mend what can be mended.")
+        bool, typer.Option("--repair", help="Remove files that no row refers to, move strays aside, and mend the rest.")
     ] = False,
     backup: Annotated[
         Path | None, typer.Option("--from", help="With --repair: a backup, from which missing files come back.")
@@ -59,13 +59,15 @@ def check(
             if repair:
                 mended = repair_storage(database, storage, settings, found, backup=backup, cancelled=stop_asked)
         orphans, missing = [item.key for item in found.orphans], [reference.key for reference in found.missing]
-        damaged = [reference.key for reference in found.damaged]
+        damaged, strays = [reference.key for reference in found.damaged], [item.key for item in found.strays]
         listener.kept(
             "checked",
             f"{found.files} files: {len(orphans)} that no row refers to ({sum(o.size for o in found.orphans)} bytes), "
-            f"{found.young} of these kept as too young; {len(missing)} missing, {len(damaged)} damaged.",
+            f"{found.young} of these kept as too young; {len(strays)} strays that are not Specimap's; "
+            f"{len(missing)} missing, {len(damaged)} damaged.",
             files=found.files,
             orphans=orphans,
+            strays=strays,
             young=found.young,
             missing=missing,
             damaged=damaged,
@@ -73,15 +75,20 @@ def check(
         if repair:
             listener.kept(
                 "repaired",
-                f"Removed {len(mended.removed)}, brought back {len(mended.brought_back)}, to be made again "
+                f"Removed {len(mended.removed)}, moved aside {len(mended.moved)}, brought back "
+                f"{len(mended.brought_back)}, to be made again "
                 f"{len(mended.forgotten)}, left {len(mended.left)}.",
                 removed=mended.removed,
+                moved=mended.moved,
                 brought_back=mended.brought_back,
                 forgotten=mended.forgotten,
                 left=mended.left,
             )
+            if not json_events:
+                for key, place in mended.moved.items():
+                    typer.echo(f"moved aside: {key} to {place}")
         elif not json_events:
-            for what, keys in (("no row", orphans), ("missing", missing), ("damaged", damaged)):
+            for what, keys in (("no row", orphans), ("stray", strays), ("missing", missing), ("damaged", damaged)):
                 for key in keys:
                     typer.echo(f"{what}: {key}")
         for key in mended.left:

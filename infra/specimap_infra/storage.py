@@ -49,7 +49,7 @@ class Storage:
     """
 
     def __init__(self, store: LocalStore | S3Store, folder: Path | None, scratch: Path) -> None:
-        self._store = store
+        self.store = store
         self.folder = folder
         """The folder, where the storage is one."""
         self._scratch = scratch
@@ -106,7 +106,7 @@ class Storage:
     def stat(self, key: str) -> Stored:
         """Return size and ETag. Raises NotFoundError."""
         with self._trying(key):
-            return _stored(obstore.head(self._store, checked(key)))
+            return _stored(obstore.head(self.store, checked(key)))
 
     def read(self, key: str, start: int = 0, stop: int | None = None) -> bytes:
         """Read the file's bytes from ``start`` up to ``stop``. Raises NotFoundError."""
@@ -114,8 +114,8 @@ class Storage:
         end = self.stat(key).size if stop is None and not whole else stop or 0
         with self._trying(key):
             if whole:
-                return bytes(obstore.get(self._store, checked(key)).bytes())
-            return bytes(obstore.get_range(self._store, checked(key), start=start, end=end)) if end > start else b""
+                return bytes(obstore.get(self.store, checked(key)).bytes())
+            return bytes(obstore.get_range(self.store, checked(key), start=start, end=end)) if end > start else b""
 
     def stream(self, key: str, start: int = 0, stop: int | None = None) -> Iterator[bytes]:
         """Read as :meth:`read` does, piece by piece. Raises NotFoundError before the first piece."""
@@ -137,7 +137,7 @@ class Storage:
     def list(self, prefix: str) -> Iterator[Stored]:
         """List all files below a prefix."""
         with self._trying(prefix):
-            for batch in obstore.list(self._store, checked(prefix) + "/"):
+            for batch in obstore.list(self.store, checked(prefix) + "/"):
                 yield from map(_stored, batch)
 
     def fetch(self, key: str, target: Path) -> None:
@@ -173,14 +173,14 @@ class Storage:
     def put(self, key: str, data: bytes) -> None:
         """Write a file whole or not at all."""
         with self._trying(key):
-            obstore.put(self._store, checked(key), data)
+            obstore.put(self.store, checked(key), data)
 
     def put_file(self, key: str, source: Path) -> None:
         """Move a local file into the storage, whole or not at all; ``source`` is gone afterwards."""
         local = self.path(key)
         with self._trying(key):
             if local is None:
-                obstore.put(self._store, checked(key), source, chunk_size=8 * CHUNK)
+                obstore.put(self.store, checked(key), source, chunk_size=8 * CHUNK)
                 source.unlink()
                 return
             with disk_errors(local):
@@ -240,8 +240,8 @@ class Storage:
                     local.unlink(missing_ok=True)
                 return
             for at in range(0, len(keys), 1000):
-                obstore.delete(self._store, keys[at : at + 1000])
-            obstore.delete(self._store, checked(key))
+                obstore.delete(self.store, keys[at : at + 1000])
+            obstore.delete(self.store, checked(key))
 
     def _aside(self, name: str) -> Path:
         assert self.folder is not None

@@ -19,7 +19,8 @@ from specimap_infra.database import Database, utc_now
 from specimap_infra.references import PLACES, REMAKEABLE, Reference, column_of, references
 from specimap_infra.settings import ServiceSettings
 from specimap_infra.storage import Storage, Stored
-from specimap_infra.tables import FINAL_STATES, Base, Export, Job, Upload
+from specimap_infra.strays import UPLOADS, everything, is_own, leads_to, move_aside
+from specimap_infra.tables import FINAL_STATES, Base, Export, Job, Upload, UploadPart
 
 SAFE_HOURS = 24.0
 """Age below which a file that no row refers to may be one whose row is about to be written."""
@@ -32,6 +33,8 @@ class Findings:
     files: int = 0
     orphans: list[Stored] = field(default_factory=list)
     """Files that no row refers to, of a safe age."""
+    strays: list[Stored] = field(default_factory=list)
+    """What Specimap has not put there, of a safe age: in another folder, under a strange name, or a link."""
     young: int = 0
     """Files that no row refers to, and that may still get one."""
     missing: list[Reference] = field(default_factory=list)
@@ -42,7 +45,7 @@ class Findings:
     @property
     def clean(self) -> bool:
         """Whether there is nothing to repair."""
-        return not (self.orphans or self.missing or self.damaged)
+        return not (self.orphans or self.strays or self.missing or self.damaged)
 
 
 @dataclass
@@ -51,6 +54,8 @@ class Repaired:
 
     removed: list[str] = field(default_factory=list)
     """Files that no row referred to."""
+    moved: dict[str, str] = field(default_factory=dict)
+    """Where strays lie now, by their keys before."""
     forgotten: list[str] = field(default_factory=list)
     """Files that are made again on demand, since their rows are gone."""
     brought_back: list[str] = field(default_factory=list)
@@ -78,19 +83,21 @@ def check_storage(
     """
     oldest = utc_now() - datetime.timedelta(hours=safe_hours)
     # The files before the rows: a file is stored before its row is written.
-    there = {item.key: item for place in PLACES for item in _listed(storage, place)}
+    there = {item.key: item for item in everything(storage)}
     with database.session() as session:
         referred = list(references(session))
+        known = {reference.key for reference in referred} | _parts(session)
         going_on = _going_on(session)
-    findings = Findings(files=len(there))
-    known = {reference.key for reference in referred}
+    findings = Findings(files=sum(key.partition("/")[0] in PLACES for key in there))
     for item in there.values():
-        if not _is_known(item.key, known):
-            safe = _changed(storage, item) < oldest and not item.key.startswith(going_on)
-            if safe:
-                findings.orphans.append(item)
-            else:
-                findings.young += 1
+        if _is_known(item.key, known) or _is_way(storage, item.key, known):
+            continue
+        if item.modified >= oldest or item.key.startswith(going_on):
+            findings.young += 1
+        elif is_own(storage, item.key):
+            findings.orphans.append(item)
+        else:
+            findings.strays.append(item)
     folders = _sizes(there, {reference.key for reference in referred if reference.folder})
     for number, reference in enumerate(referred):
         if cancelled():
@@ -114,8 +121,9 @@ def repair_storage(
 ) -> Repaired:
     """Mend what a check has found.
 
-    Files that no row refers to are removed. What is missing comes from the backup; where that has none, rows of files
-    that can be made again are removed, and everything else stays as it is.
+    Files that no row refers to are removed; strays are moved aside, since they are not Specimap's to remove. What is
+    missing comes from the backup; where that has none, rows of files that can be made again are removed, and everything
+    else stays as it is.
 
     Raises:
         CancelledError: ``cancelled`` came true; what was mended stays so.
@@ -126,7 +134,11 @@ def repair_storage(
     done = Repaired()
     with database.session() as session:
         # Rows may have been written since the check.
-        known = {reference.key for reference in references(session)}
+        known = {reference.key for reference in references(session)} | _parts(session)
+    for item in findings.strays:
+        _check_stop(cancelled)
+        if not _is_known(item.key, known) and (place := move_aside(storage, item.key)) is not None:
+            done.moved[item.key] = place
     for item in findings.orphans:
         _check_stop(cancelled)
         if not _is_known(item.key, known):
@@ -160,16 +172,22 @@ def _listed(storage: Storage, prefix: str) -> Iterator[Stored]:
         return
 
 
+def _parts(session: Session) -> set[str]:
+    """Parts of unfinished uploads."""
+    return set(session.scalars(sa.select(UploadPart.storage_key)))
+
+
 def _going_on(session: Session) -> tuple[str, ...]:
     """Folders in which files are stored whose rows come later: of jobs, exports and uploads that have not ended."""
     jobs = session.execute(sa.select(Job.id, Job.acquisition_id).where(Job.state.not_in(FINAL_STATES))).all()
     exports = session.scalars(sa.select(Export.id).where(Export.state.not_in(FINAL_STATES)))
-    uploads = session.scalars(sa.select(Upload.acquisition_id).where(Upload.state == "open"))
-    acquisitions = {job.acquisition_id for job in jobs} | set(uploads)
+    uploads = session.execute(sa.select(Upload.id, Upload.acquisition_id).where(Upload.state == "open")).all()
+    acquisitions = {job.acquisition_id for job in jobs} | {upload.acquisition_id for upload in uploads}
     return (
         *(f"jobs/{job.id}/" for job in jobs),
         *(f"exports/{id}/" for id in exports),
         *(f"acquisitions/{id}/" for id in acquisitions),
+        *(f"{UPLOADS}/{upload.id}/" for upload in uploads),
     )
 
 
@@ -179,19 +197,13 @@ def _parents(key: str) -> Iterator[str]:
         yield key
 
 
+def _is_way(storage: Storage, key: str, known: set[str]) -> bool:
+    """Whether an item is a link that a person made, through which files are reached that rows refer to."""
+    return storage.folder is not None and (storage.folder / key).is_symlink() and leads_to(key, known)
+
+
 def _is_known(key: str, known: set[str]) -> bool:
     return key in known or any(parent in known for parent in _parents(key))
-
-
-def _changed(storage: Storage, item: Stored) -> datetime.datetime:
-    """When a file came into the storage: in a folder by a rename, which leaves the time of its last write."""
-    path = storage.path(item.key)
-    if path is None:
-        return item.modified
-    try:
-        return datetime.datetime.fromtimestamp(path.stat().st_ctime, datetime.UTC)
-    except FileNotFoundError:
-        return utc_now()
 
 
 def _sizes(there: Mapping[str, Stored], folders: set[str]) -> dict[str, int]:

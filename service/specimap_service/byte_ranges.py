@@ -19,6 +19,7 @@ from starlette.types import Receive, Scope, Send
 from specimap_core.errors import NotFoundError
 from specimap_infra.errors import StorageUnavailableError
 from specimap_infra.storage import Storage
+from specimap_service.client_gone import disconnected
 from specimap_service.errors import PreconditionFailedError, RangeNotSatisfiableError
 from specimap_service.head_requests import only_head
 from specimap_service.problems import problem_response
@@ -122,7 +123,7 @@ class _Streamed(Response):
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send the range; stop reading when the client disconnects."""
         await send({"type": "http.response.start", "status": self.status_code, "headers": self.raw_headers})
-        gone = asyncio.ensure_future(_disconnected(receive))
+        gone = asyncio.ensure_future(disconnected(receive))
         ahead = self._read(self._start)
         try:
             at = self._start
@@ -139,11 +140,6 @@ class _Streamed(Response):
     def _read(self, at: int) -> asyncio.Future[bytes]:
         stop = min(at + self._source.piece, self._stop)
         return asyncio.ensure_future(to_thread.run_sync(self._source.read, at, stop))
-
-
-async def _disconnected(receive: Receive) -> None:
-    while (await receive())["type"] != "http.disconnect":
-        pass
 
 
 # ---- sources ------------------------------------------------------------------------------------------

@@ -10,13 +10,15 @@ import threading
 from collections import Counter, deque
 from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import Future
-from contextlib import asynccontextmanager, contextmanager, suppress
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import ParamSpec, TypeVar
 
 from anyio import CapacityLimiter, to_thread
+from starlette.types import Receive
 
+from specimap_service.client_gone import while_connected
 from specimap_service.errors import OverloadedError, TooManyAtOnceError
 
 P = ParamSpec("P")
@@ -88,6 +90,18 @@ class FairTurns:
             yield
         finally:
             self._give_back(ticket)
+
+    async def run_while(self, receive: Receive, key: str, work: Callable[[], T]) -> T:
+        """Run blocking work as :meth:`run` does, unless the client goes away while it waits for its turn.
+
+        Work that has begun goes on to its end: it would leave what is half done. The request's body has been read.
+
+        Raises ClientDisconnect besides.
+        """
+        turn = AsyncExitStack()
+        async with turn:
+            await while_connected(receive, turn.enter_async_context(self.turn_async(key)))
+            return await to_thread.run_sync(work, limiter=self._threads)
 
     async def run(self, key: str, work: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> T:
         """Run blocking work in a thread, in a turn; the threads are none of those that answer other requests.

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import sqlalchemy as sa
 from fastapi import Query, Request, Response
-from pydantic import AfterValidator, AwareDatetime, BaseModel, Field
+from pydantic import AfterValidator, AwareDatetime, BaseModel, Field, WithJsonSchema
 
 Item = TypeVar("Item")
 Limit = Annotated[int, Query(ge=1, le=500, description="Most items of a page.")]
@@ -36,7 +36,12 @@ def _year_in_range(value: datetime.datetime) -> datetime.datetime:
     return value
 
 
-Moment = Annotated[AwareDatetime, AfterValidator(_year_in_range)]
+Moment = Annotated[
+    AwareDatetime,
+    AfterValidator(_year_in_range),
+    # 1900 to 8999: the one year more would make the pattern longer than it is worth.
+    WithJsonSchema({"type": "string", "format": "date-time", "pattern": "^(19|[2-8][0-9])[0-9]{2}-"}),
+]
 """A time with its zone, far enough from the calendar's ends to have a UTC time."""
 
 CreatedAfter = Annotated[Moment | None, Query(description="Only those created at this time or later.")]

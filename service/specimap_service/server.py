@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import socket
 from typing import Any
@@ -41,3 +42,13 @@ def notice_dead_peers(listener: socket.socket, seconds: float) -> None:
     for name, value in {**PROBES, "TCP_USER_TIMEOUT": int(seconds * 1000)}.items():
         if hasattr(socket, name):  # Linux has all of them
             listener.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+
+
+def keep_collections_short() -> None:
+    """Leave all that lives by now out of garbage collections: call it once, when the process has started.
+
+    The app, its schemas and its libraries live as long as the process, and a full collection looks at all of them:
+    0.15 s in which no request is answered, every few hundred requests for long lists.
+    """
+    gc.collect()
+    gc.freeze()

@@ -13,11 +13,13 @@ import sqlalchemy as sa
 from specimap_core.errors import NotFoundError
 from specimap_infra import storage_check
 from specimap_infra.backup import create_backup
+from specimap_infra.database import Database
 from specimap_infra.ids import new_id
+from specimap_infra.migrate import migrate
 from specimap_infra.settings import load_settings
 from specimap_infra.storage import Storage
 from specimap_infra.storage_check import check_storage, repair_storage
-from specimap_infra.tables import Artefact, Export, Job, StoredFile
+from specimap_infra.tables import Artefact, Export, Job, StoredFile, Upload
 from tests.support.backup_scene import place, specimap, stored
 from tests.support.result_scene import Result, put_result
 from tests.support.service_scene import Running
@@ -132,6 +134,74 @@ def test_what_is_young_is_left_alone(service: Running, result: Result) -> None:
 
 
 @pytest.mark.usefixtures("later")
+def test_strays_are_found_anywhere_and_moved_aside(service: Running, result: Result, tmp_path: Path) -> None:
+    root = service.storage.folder
+    assert root is not None
+    whole = stored(service.storage)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "secret").write_bytes(b"x")
+    strays = ["notes.txt", "old backup/a b.tar", "jobs/#1", "acquisitions/ä.raw", "exports/link", "exports/broken"]
+    for key in strays[:4]:
+        (root / key).parent.mkdir(parents=True, exist_ok=True)
+        (root / key).write_bytes(key.encode())
+    (root / "exports").mkdir(exist_ok=True)
+    (root / "exports" / "link").symlink_to(elsewhere)
+    (root / "exports" / "broken").symlink_to("nowhere")
+    found = check_storage(service.database, service.storage)
+    assert (sorted(item.key for item in found.strays), found.orphans, found.clean) == (sorted(strays), [], False)
+    done = repair_storage(service.database, service.storage, service.settings, found)
+    assert (sorted(done.moved), done.removed) == (sorted(strays), [])
+    for key in strays[:4]:
+        assert (root / done.moved[key]).read_bytes() == key.encode()
+        assert not (root / key).exists()
+    assert (elsewhere / "secret").read_bytes() == b"x"
+    assert stored(service.storage) == whole
+    # What was moved aside is left to a person.
+    assert check_storage(service.database, service.storage).clean
+
+
+@pytest.mark.usefixtures("later")
+def test_places_and_results_behind_links_are_no_strays(service: Running, result: Result, tmp_path: Path) -> None:
+    root = service.storage.folder
+    assert root is not None
+    for key in ("jobs", f"acquisitions/{result.acquisition_id}"):
+        if not (root / key).exists():
+            continue
+        (tmp_path / "disk" / key).parent.mkdir(parents=True, exist_ok=True)
+        (root / key).rename(tmp_path / "disk" / key)
+        (root / key).symlink_to(tmp_path / "disk" / key)
+    add_file(service, result)
+    assert check_storage(service.database, service.storage).clean
+
+
+@pytest.mark.usefixtures("later")
+def test_parts_of_uploads_and_what_was_being_written_go_once_nothing_needs_them(
+    service: Running, result: Result
+) -> None:
+    kept, gone = f"uploads/{new_id('up')}/0-a", [f"uploads/{new_id('up')}/0-b", "tmp/check-0"]
+    now = datetime.datetime.now(datetime.UTC)
+    with service.database.session() as session:
+        session.add(
+            Upload(
+                id=kept.split("/")[1],
+                acquisition_id=result.acquisition_id,
+                role="photo",
+                name="",
+                size=9,
+                state="open",
+                created_by="k",
+                created_at=now,
+                expires_at=now,
+            )
+        )
+    for key in (kept, *gone):
+        service.storage.put(key, b"x")
+    found = check_storage(service.database, service.storage)
+    assert (sorted(item.key for item in found.orphans), found.strays, found.young) == (sorted(gone), [], 1)
+
+
+@pytest.mark.usefixtures("later")
 def test_what_is_being_published_is_left_alone_however_old(service: Running, result: Result) -> None:
     """A worker that waits for the database for days has stored its result, and its row comes afterwards."""
     with service.database.session() as session:
@@ -200,8 +270,34 @@ def test_the_command_tells_and_mends(tmp_path: Path, monkeypatch: pytest.MonkeyP
         assert specimap(given, "keys", "list").returncode == 0
         clean = specimap(given, "storage", "check", "--json")
         assert (clean.returncode, json.loads(clean.stdout.splitlines()[-1])["orphans"]) == (0, [])
-        Storage.open(load_settings(**given)).put(ORPHANS[0], b"x")
+        storage = Storage.open(load_settings(**given))
+        storage.put(ORPHANS[0], b"x")
+        storage.put("notes", b"x")
         young = specimap(given, "storage", "check", "--repair", "--json")
         assert young.returncode == 0, young.stderr
         checked, repaired = (json.loads(line) for line in young.stdout.splitlines()[-2:])
-        assert (checked["young"], checked["orphans"], repaired["removed"]) == (1, [], [])
+        assert (checked["young"], checked["orphans"], repaired["removed"], repaired["moved"]) == (2, [], [], {})
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("later")
+def test_strays_in_a_bucket_are_moved_aside_within_the_prefix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "test")
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "test")
+    with place("shared", tmp_path / "data") as given:
+        settings = load_settings(**given)
+        storage, database = Storage.open(settings), Database.open(settings.database)
+        migrate(database)
+        for key in ("notes", "old/a", ORPHANS[0]):
+            storage.put(key, b"x")
+        found = check_storage(database, storage)
+        assert (sorted(item.key for item in found.strays), [item.key for item in found.orphans]) == (
+            ["notes", "old/a"],
+            [ORPHANS[0]],
+        )
+        done = repair_storage(database, storage, settings, found)
+        assert (sorted(done.moved), done.removed) == (["notes", "old/a"], [ORPHANS[0]])
+        assert storage.read(done.moved["old/a"]) == b"x"
+        assert not is_stored(storage, "notes")
+        assert check_storage(database, storage).clean
+        database.close()

@@ -149,6 +149,46 @@ def test_more_files_than_may_wait_are_refused_and_kept(beside: Running, tmp_path
     assert client.get(f"{place}/result").json()["state"] == "finished"
 
 
+def test_a_file_whose_client_went_away_while_it_waited_is_not_judged(beside: Running, tmp_path: Path) -> None:
+    hold, started = tmp_path / "hold", tmp_path / "started"
+    hold.touch()
+    started.mkdir()
+    judge: Judge = beside.app.state.judge
+    judge._command = (sys.executable, "-c", HELD.format(hold=hold, started=started), *judge._command[3:])
+    intake = INTAKE.of(beside.app)
+    intake.bounds = TurnBounds(at_once=1, of_key=1, waiting=9, waiting_of_key=9)
+    client = beside.client()
+    acquisition = new_acquisition(client)
+    place = created(client, acquisition, "photo", 4)
+    headers = {**TUS, "Upload-Offset": "0", "Content-Type": OCTETS}
+    impatient = httpx.Timeout(60, read=0.5)
+    with asking(lambda k: send(client, acquisition, "photo", "x.png", b"HOLD"), 1) as uploads:
+        try:
+            until(lambda: len(list(started.iterdir())) == 1, 20, "the file that is judged")
+            asks: list[Callable[[], httpx.Response]] = [
+                lambda: client.patch(place, content=b"HOLD", headers=headers, timeout=impatient),
+                lambda: client.get(f"{place}/result", timeout=impatient),
+                lambda: client.head(place, headers=TUS, timeout=impatient),
+                lambda: client.post(
+                    f"/v1/acquisitions/{acquisition}/files",
+                    data={"role": "photo"},
+                    files={"file": ("y.png", b"HOLD")},
+                    timeout=impatient,
+                ),
+            ]
+            for ask in asks:
+                with pytest.raises(httpx.ReadTimeout):
+                    ask()
+                until(lambda: intake.waiting == 0, 10, "the end of the wait")
+        finally:
+            hold.unlink()
+        assert uploads[0].result().status_code == 201
+    assert len(list(started.iterdir())) == 1
+    assert len(client.get(f"/v1/acquisitions/{acquisition}/files").json()) == 1
+    # The bytes that arrived were kept.
+    assert client.get(f"{place}/result").json()["state"] == "finished"
+
+
 # ---- pictures -----------------------------------------------------------------------------------------
 
 

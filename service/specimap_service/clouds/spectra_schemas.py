@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
@@ -23,7 +23,16 @@ class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
+def _say_one_of(schema: dict[str, Any]) -> None:
+    """Say in a schema that exactly one of its properties is there and not null."""
+    schema["oneOf"] = [
+        {"required": [name], "properties": {name: {"not": {"type": "null"}}}} for name in schema["properties"]
+    ]
+
+
 class _OneOf(_Strict):
+    model_config = ConfigDict(extra="forbid", json_schema_extra=_say_one_of)
+
     @model_validator(mode="after")
     def _one(self) -> Self:
         given = [name for name in type(self).model_fields if getattr(self, name) is not None]
@@ -101,6 +110,7 @@ class Bands(_OneOf):
         max_length=65536,
         fail_fast=True,
         description="Bands by number, in this order, each once.",
+        json_schema_extra={"uniqueItems": True},
     )
 
     @model_validator(mode="after")

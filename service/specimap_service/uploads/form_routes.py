@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from functools import partial
 from typing import Any
 
 from fastapi import APIRouter, Request
@@ -102,9 +103,14 @@ async def add_files(
         context.metrics.uploaded.inc(sum(part.size for part in parts))
         stored: list[File] = []
         for part in parts:
-            # The first may be refused; those after it wait, so that a form does not end half stored.
-            run = uploads.intake.go_on if stored else uploads.intake.run
-            stored.append(await run(principal.key_id, _store, uploads, principal, acquisition_id, part, stored))
+            work = partial(_store, uploads, principal, acquisition_id, part, stored)
+            # The first may be refused, and is given up where its client goes away; those after it wait, so that a form
+            # does not end half stored.
+            stored.append(
+                await uploads.intake.go_on(principal.key_id, work)
+                if stored
+                else await uploads.intake.run_while(request.receive, principal.key_id, work)
+            )
         return stored
     finally:
         await asyncio.to_thread(form.close)

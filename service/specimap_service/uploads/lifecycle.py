@@ -7,10 +7,12 @@ import hashlib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import sqlalchemy as sa
 from fastapi.concurrency import run_in_threadpool
 from sqlalchemy.orm import Session
+from starlette.types import Receive
 
 from specimap_core.errors import NotFoundError
 from specimap_infra.database import rows_changed, utc_now
@@ -119,8 +121,10 @@ class Uploads:
             self.files.remove(upload.id)
         return found
 
-    async def current(self, upload_id: str, principal: Principal) -> Upload:
+    async def current(self, upload_id: str, principal: Principal, receive: Receive | None = None) -> Upload:
         """Return the upload as it stands; finish one whose last byte arrived in a process that died.
+
+        ``receive``: of a request without a body, as of :meth:`finish_in_turn`.
 
         Raises:
             NotFoundError: there is none in the key's project.
@@ -129,14 +133,20 @@ class Uploads:
             TooManyAtOnceError, OverloadedError: it is whole, and too many files wait to be judged.
         """
         upload, whole = await run_in_threadpool(self._current, upload_id, principal)
-        return await self.finish_in_turn(upload) if whole else upload
+        return await self.finish_in_turn(upload, receive) if whole else upload
 
-    async def finish_in_turn(self, upload: Upload) -> Upload:
+    async def finish_in_turn(self, upload: Upload, receive: Receive | None = None) -> Upload:
         """Finish an upload that has arrived whole, as :meth:`finish` does, in a turn of its key.
 
-        Raises TooManyAtOnceError and OverloadedError besides: the next request tries again; the bytes are kept.
+        ``receive``: of the request, when its body has been read. Where its client goes away before the turn has come,
+        the file is not judged; the bytes are kept, and the next request tries again.
+
+        Raises TooManyAtOnceError and OverloadedError besides, and ClientDisconnect: the bytes are kept too.
         """
-        return await self.intake.run(upload.created_by, self.finish, upload.id)
+        work = partial(self.finish, upload.id)
+        if receive is None:
+            return await self.intake.run(upload.created_by, work)
+        return await self.intake.run_while(receive, upload.created_by, work)
 
     def _current(self, upload_id: str, principal: Principal) -> tuple[Upload, bool]:
         check_id(upload_id)

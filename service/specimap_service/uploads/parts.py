@@ -23,11 +23,12 @@ from specimap_infra.database import Database, utc_now
 from specimap_infra.errors import StorageUnavailableError
 from specimap_infra.logs import logger
 from specimap_infra.storage import Storage
+from specimap_infra.strays import UPLOADS
 from specimap_infra.tables import Upload, UploadPart
 from specimap_service.uploads.files import Appender, UploadFiles, busy, check_id
 from specimap_service.uploads.locks import Held, UploadLocks
 
-PREFIX = "uploads"
+PREFIX = UPLOADS
 """Folder in the storage."""
 PART = 8 * 1024 * 1024
 SMALL = 1024 * 1024

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, cast
 
-from fastapi import APIRouter, Response
+from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -43,9 +43,9 @@ class UploadResult(BaseModel):
 
 
 @router.get("/uploads/{upload_id}/result", operation_id="uploads.get_result")
-async def get_result(principal: Uploader, uploads: UploadsDep, upload_id: UploadId) -> UploadResult:
+async def get_result(request: Request, principal: Uploader, uploads: UploadsDep, upload_id: UploadId) -> UploadResult:
     """Return the state of an upload; for a finished one its file, with the judgement and advice on retaking it."""
-    upload = await uploads.current(upload_id, principal)
+    upload = await uploads.current(upload_id, principal, request.receive)
     return await run_in_threadpool(_result, uploads, upload)
 
 

@@ -49,6 +49,11 @@ class Exchange:
         self.checksum: tuple[str, bytes] | None = None
         self.headers: dict[str, str] = {}
 
+    @property
+    def connection(self) -> Receive:
+        """What tells that the client has gone, once the body has been read."""
+        return self._receive
+
     async def receive(self) -> Message:
         """Return the next message: of a body that was checked before, or of the connection."""
         if self._spool is not None:

@@ -39,7 +39,9 @@ async def _check_request(request: Request, principal: Uploader, uploads: Uploads
     if request.method == "POST":
         _check_creation(request)
         return
-    upload = exchange.upload = await uploads.current(request.path_params["uuid"], principal)
+    upload = exchange.upload = await uploads.current(
+        request.path_params["uuid"], principal, exchange.connection if request.method == "HEAD" else None
+    )
     check_alive(upload)
     if upload.state != "open":
         await run_in_threadpool(_add_result_headers, uploads, upload, exchange)
@@ -117,7 +119,7 @@ def _completion_hook(uploads: UploadsDep) -> Callable[[str, dict[str, str]], Awa
     async def complete(upload_id: str, metadata: dict[str, str]) -> None:
         exchange = tus.exchange()
         if exchange.upload is not None and exchange.upload.state == "open":
-            exchange.upload = await uploads.finish_in_turn(exchange.upload)
+            exchange.upload = await uploads.finish_in_turn(exchange.upload, exchange.connection)
         if exchange.upload is not None:
             await asyncio.to_thread(_add_result_headers, uploads, exchange.upload, exchange)
 
