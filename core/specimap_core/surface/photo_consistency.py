@@ -26,8 +26,9 @@ OBLIQUE = 1.5
 IMAGE_MARGIN_PX = 6
 SPARE_BEFORE_HIDDEN = 3
 """Candidates beyond those wanted, since some will be hidden."""
-CHECKING = 5
-"""Every so many-th photo that sees a place is left out of the comparison, to check the result with."""
+CHECKING = slice(7, None, 4)
+"""Of the photos that see a place, the most frontal first, those left out of the comparison to check the result with."""
+MOST_CHECKING = 4
 SPARE_BEFORE_HIGHLIGHTS = 4
 """Views looked at beyond those wanted, so that highlights can be left out."""
 HIGHLIGHT = 1.04
@@ -96,13 +97,13 @@ def choose_views(
     mesh: Mesh, chosen: Ints, photographs: Photographs, most: int, least_cosine: float, *, workers: int = 1
 ) -> Ints:
     """For each of the ``chosen`` (n,) vertices the photos that are compared there, (n, most), -1 where there are fewer:
-    those that see it most squarely and unhidden, and not in a highlight. Every fifth of them is left out, so that the
-    result can be checked with photos that did not make it.
+    those that see it most squarely and unhidden, and not in a highlight. Of the more oblique, some are left out,
+    so that the result can be checked with photos that did not make it.
 
     Highlights move over the surface with the camera and lie where the lamp's mirror image is, below it: photos that
     agree on them agree on a wrong place.
     """
-    looked_at = most + (most - 1) // (CHECKING - 1) + SPARE_BEFORE_HIGHLIGHTS
+    looked_at = most + MOST_CHECKING + SPARE_BEFORE_HIGHLIGHTS
     views = np.empty((len(chosen), looked_at), np.int64)
     caster = RayCaster(mesh)
 
@@ -113,7 +114,7 @@ def choose_views(
         list(pool.map(run, [slice(k, k + CHUNK) for k in range(0, len(chosen), CHUNK)]))
     views[_highlights(mesh.vertices[chosen].astype(float), views, photographs)] = -1
     packed = np.take_along_axis(views, np.argsort(views < 0, axis=1, kind="stable"), 1)
-    return np.delete(packed, np.s_[CHECKING - 1 :: CHECKING], axis=1)[:, :most]
+    return np.delete(packed, CHECKING, axis=1)[:, :most]
 
 
 def _most_frontal(caster: RayCaster, chosen: Ints, photographs: Photographs, most: int, least_cosine: float) -> Ints:
