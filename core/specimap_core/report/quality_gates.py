@@ -50,11 +50,16 @@ def corner_limit_px(report: Report) -> float:
 
 
 def outlying_photos(report: Report) -> list[Outlying]:
-    """Photos whose corners lie far more off than the others', the worst first."""
+    """Photos whose corners lie far more off than the others', the worst first.
+
+    A marker is as far off as three of its corners are: where something hides its edge, one or two corners are
+    misplaced, which the adjustment takes out, and a card that moved takes all four along.
+    """
     photos = [p for p in report.photo_corners or [] if p.residuals_px]
     if not photos:
         return []
-    squares = [(np.array(p.residuals_px).reshape(len(p.residuals_px), 4, 2) ** 2).sum(2).mean(1) for p in photos]
+    distances = [(np.array(p.residuals_px).reshape(len(p.residuals_px), 4, 2) ** 2).sum(2) for p in photos]
+    squares = [np.sort(d, axis=1)[:, 1] for d in distances]
     rms = np.array([float(np.sqrt(s.mean())) for s in squares])
     limit = max(OUTLYING_PX * _scale(photos), OUTLYING_MEDIANS * float(np.median(rms)))
     found = [

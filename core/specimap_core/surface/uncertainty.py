@@ -54,9 +54,9 @@ class Shares:
     which a sideways error turns into height.
     """
 
-    of_width: float = 0.1463
-    of_bend: float = 0.8491
-    of_jump: float = 0.4083
+    of_width: float = 0.1365
+    of_bend: float = 0.8483
+    of_jump: float = 0.4131
 
 
 SHARES = Shares()

@@ -17,6 +17,8 @@ LEAST_PLACES = 20
 LEAST_PATCHES = 8
 """Of a photo, to say by how much all of them are displaced together."""
 MEDIAN_OF_NORMAL = 0.6745
+QUARTILE_OF_MEAN = 1.386
+"""Third quartile of squared distances in two dimensions over their mean, for a normal distribution."""
 MEDIAN_OF_CHI2 = 1.386
 """Of a chi-squared distribution of two degrees of freedom."""
 ERROR_OF_OFFSET, P95_OF_OFFSET = 1.75, 2.8
@@ -84,7 +86,8 @@ def check_surface(sites: Sites, found: Displacements, pixel_mm: float) -> Surfac
 
 
 def photo_shift_px(found: Displacements, offsets: Offsets) -> float | None:
-    """Root mean square over the photos of the median displacement of their patches, surface errors taken out."""
+    """Root mean square over the photos of the median displacement of their patches, surface errors taken out; one told
+    by three quarters of the photos, so that a single one that is off does not speak for all."""
     pixels = np.einsum("eij,ej->ei", found.px_per_mm, offsets.residual_mm)
     checked = np.isfinite(offsets.offset_mm)[found.site]
     shifts = [
@@ -92,7 +95,9 @@ def photo_shift_px(found: Displacements, offsets: Offsets) -> float | None:
         for photo in np.unique(found.photo[checked])
         if (of := checked & (found.photo == photo)).sum() >= LEAST_PATCHES
     ]
-    return float(np.sqrt((np.array(shifts) ** 2).mean())) if shifts else None
+    if not shifts:
+        return None
+    return float(np.sqrt(np.percentile((np.array(shifts) ** 2).sum(1), 75) / QUARTILE_OF_MEAN / 2))
 
 
 def _without(value: float, noise: float) -> float:
