@@ -53,8 +53,8 @@ class Refined:
     """A refined mesh, and how it came about.
 
     ``views`` (V,): photos that were compared at a vertex, 0 where none were. ``sharpness`` (V,), 1/mm^2: how fast
-    their correlation falls off along the normal, its curvature times its height; 0 where it has no top within reach,
-    NaN where the vertex was not refined. ``found`` (V,): whether enough photos agreed on the vertex's place; the
+    their correlation falls off along the normal, its curvature; 0 where it has no top within reach, NaN where the
+    vertex was not refined. ``found`` (V,): whether enough photos agreed on the vertex's place; the
     others follow their neighbours. ``parents`` (V, 2): the vertices of the mesh before that a vertex lies between,
     twice the same where it was one of them.
     """
@@ -163,11 +163,11 @@ def _refined_once(
             progress(0.8 * done / len(parts))
     both = averaged(np.hstack([product, square]), edges, one.rounds)
     scores = both[:, : one.steps] / (both[:, one.steps :] + np.float32(OWN_VARIANCE))
-    best, sharp = _best_offsets(scores, offsets)
+    best, curvature, height = _tops(scores, offsets)
     compared = (views >= 0).sum(1)
     by_chance = CHANCE * np.sqrt(2 / np.maximum(compared * (compared - 1), 1))
     sure = (compared >= LEAST_VIEWS) & (scores.max(1) > np.maximum(settings.least_score, by_chance))
-    weight = np.where(sure, sharp, 0.0)
+    weight = np.where(sure, curvature * height, 0.0)
     if not (weight > 0).any():
         return start
     weight = np.minimum(weight / np.median(weight[weight > 0]), MOST_WEIGHT)
@@ -176,7 +176,7 @@ def _refined_once(
     vertices[chosen] = points + moved[:, None] * directions
     counts, sharpness, found = start.views.copy(), start.sharpness.copy(), start.found.copy()
     counts[chosen], found[chosen] = compared, sure
-    sharpness[chosen] = sharp / (offsets[1] - offsets[0]) ** 2
+    sharpness[chosen] = curvature / (offsets[1] - offsets[0]) ** 2
     return replace(start, mesh=_placed(mesh, vertices), views=counts, sharpness=sharpness, found=found)
 
 
@@ -228,8 +228,9 @@ def _finer(refined: Refined, chosen: Ints, views: Ints) -> tuple[Refined, Ints, 
     return with_new, np.concatenate([chosen, added]), np.concatenate([views, views[number[a]]])
 
 
-def _best_offsets(scores: Singles, offsets: Floats) -> tuple[Floats, Floats]:
-    """Offset of the parabola's top (V,) and how sharp it is (V,); 0 sharp where the top is at the end."""
+def _tops(scores: Singles, offsets: Floats) -> tuple[Floats, Floats, Floats]:
+    """Offset of the parabola's top (V,), its curvature (V,) for a step of one, 0 where the top is at the end, and its
+    height (V,)."""
     step = offsets[1] - offsets[0]
     top = scores.argmax(1)
     middle = np.clip(top, 1, len(offsets) - 2)
@@ -239,4 +240,4 @@ def _best_offsets(scores: Singles, offsets: Floats) -> tuple[Floats, Floats]:
     curved = bend < -1e-6
     shift = np.clip(np.where(curved, 0.5 * (left - right) / np.where(curved, bend, -1.0), 0.0), -1, 1)
     inner = curved & (top > 0) & (top < len(offsets) - 1)
-    return offsets[middle] + shift * step, np.where(inner, -bend * np.maximum(centre, 0), 0.0)
+    return offsets[middle] + shift * step, np.where(inner, -bend, 0.0), np.maximum(centre, 0)

@@ -34,7 +34,8 @@ LEAST_SIGMA_MM = 0.01
 LEAST_COSINE = 0.15
 """A surface seen more obliquely than this tells little about its height."""
 
-MOST_VIEWS = 16
+ENOUGH_VIEWS = 9
+"""Photos from which on more make a place hardly surer: what is left, they share."""
 MOST_UNLIKE = 16.0
 """A vertex counts as at most this much sharper or less sharp than is usual: beyond, its own figure is chance."""
 SUPPORT_ROUNDS = 16
@@ -54,7 +55,7 @@ class Shares:
     which a sideways error turns into height.
     """
 
-    of_width: float = 0.1365
+    of_width: float = 0.161
     of_bend: float = 0.8483
     of_jump: float = 0.4131
 
@@ -84,7 +85,7 @@ class Evidence:
         measured = done & (scatter < UNSEEN_SIGMA_MM) & (len(topped) > 0)
         usual = float(np.median(topped)) if len(topped) else 1.0
         sharpness = np.clip(refined.sharpness[measured], usual / MOST_UNLIKE, usual * MOST_UNLIKE)
-        fewer = MOST_VIEWS / np.maximum(refined.views[measured], 1)
+        fewer = np.maximum(ENOUGH_VIEWS / np.maximum(refined.views[measured], 1), 1)
         return Evidence(
             scatter,
             measured,
