@@ -46,7 +46,7 @@ CHANCE = 1.2
 for k photos is the root of 2 / (k (k - 1)): a window holds some pixels, but the best of some offsets is taken."""
 HEIGHT_POWER = 0.4
 """How sure a place is follows the curvature of the photos' agreement over this power of its height; 1 would be the
-width of its top. Gloss lowers the agreement by more than it makes a place unsure. Chosen with the shares of ``sigma_mm``."""
+width of its top. Gloss lowers the agreement by more than it makes a place unsure. Chosen with the shares of sigma."""
 MOST_WEIGHT = 5.0
 """Of a vertex, over the median: beyond, sharpness is chance."""
 
