@@ -55,7 +55,7 @@ class Shares:
     which a sideways error turns into height.
     """
 
-    of_width: float = 0.196
+    of_width: float = 0.213
     of_bend: float = 0.8483
     of_jump: float = 0.4131
 
