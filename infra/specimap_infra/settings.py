@@ -292,7 +292,16 @@ def load_settings(**given: object) -> ServiceSettings:
         ) from error
 
 
-OTHER_VARIABLES = frozenset({CONFIG_VARIABLE, "SPECIMAP_DEBUG", "SPECIMAP_TEST_DATA", "SPECIMAP_URL", "SPECIMAP_KEY"})
+OTHER_VARIABLES = frozenset(
+    {
+        CONFIG_VARIABLE,
+        "SPECIMAP_DEBUG",
+        "SPECIMAP_KEY",
+        "SPECIMAP_TEST_DATA",
+        "SPECIMAP_TEST_OUTAGE_SECONDS",
+        "SPECIMAP_URL",
+    }
+)
 """Variables with the prefix that are no settings of the service."""
 
 
