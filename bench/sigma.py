@@ -22,6 +22,7 @@ from specimap_core.pipeline.outputs import Outputs
 from specimap_core.pipeline.settings import PipelineSettings
 from specimap_core.pipeline.stages import adjust_stage, mesh_of, reconstruct_stage
 from specimap_core.surface.raycast import RayCaster
+from specimap_core.surface.regions import raised_places
 from specimap_core.surface.uncertainty import (
     SHARES,
     Evidence,
@@ -52,6 +53,8 @@ JUDGING = {
     "texture 0.4, exposure 0.2 (54)": PhantomSettings(seed=54, texture_contrast=0.4, exposure_spread=0.2, **CUBE),
     "breathing 1 %, distortion (55)": PhantomSettings(seed=55, focal_spread=0.01, k1=-0.1, k2=0.03, **CUBE),
     "blur 1.2 px, gloss 0.3 (56)": PhantomSettings(seed=56, blur_px=1.2, gloss=0.3, **CUBE),
+    "1024 px photos (57)": PhantomSettings(seed=57, photo_size=1024, **CUBE),
+    "16 photos of 384 px (58)": PhantomSettings(seed=58, photos=16, photo_size=384, **CUBE),
 }
 """What they are judged on. A path-traced phantom joins each, where they are at hand."""
 TRACED_SETTING, TRACED_JUDGING = {"phantom A": "phantom_a"}, {"phantom hard": "phantom_hard"}
@@ -174,7 +177,7 @@ def specimen(folder: Path, scratch: Path) -> Specimen:
         placed.barycentric[at],
         scene.caster.interpolate(bend_mm(refined.mesh)[:, None], placed.triangle[at], placed.barycentric[at]).ravel(),
         step_height(placed.pixels, placed.xyz[:, 2], scene.refined.camera.pixel_mm)[at],
-        float(np.median(adjusted.sigma_corner_mm)),
+        scene.adjusted.sigma_layout_mm(raised_places(scene.caster.mesh.vertices, scene.adjusted.corners)),
         scene.refined.lateral_sd_mm,
         errors,
     )

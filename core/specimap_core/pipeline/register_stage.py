@@ -27,7 +27,7 @@ from specimap_core.register.registration import Surface, register_cube
 from specimap_core.report.model import Report
 from specimap_core.report.quality_gates import gated
 from specimap_core.surface.mesh_files import write_mesh_ply
-from specimap_core.verification.certificate import Evidence, gather
+from specimap_core.verification.certificate import Verification, verify
 
 REGISTERED_SHARE, CHECKED_SHARE, CLOUD_SHARE = 0.35, 0.15, 0.4
 """Shares of the stage's progress: the registration, its check, and the writing of the cloud."""
@@ -65,12 +65,14 @@ def register_stage(
         except MarkersMissingInCubeError as error:
             raise with_assumptions(error, cube.warnings) from error
         checked = REGISTERED_SHARE + CHECKED_SHARE
-        evidence = gather(registered, stage1.greys, cube, settings.refine, within(progress, REGISTERED_SHARE, checked))
-        registered = replace(registered, points=evidence.scaled(registered.points))
+        verification = verify(
+            registered, stage1.greys, cube, settings.refine, within(progress, REGISTERED_SHARE, checked)
+        )
+        registered = replace(registered, points=verification.scaled(registered.points))
         adjusted = registered.surface.adjusted
         run = RunRecord(settings, given.hashes, clock.seconds, clock.reused, given.warnings)
         report = gated(build_report(stage1, adjusted, registered, run), settings.adjust.edge_mm)
-        report = certified(report, evidence)
+        report = certified(report, verification)
 
         def attributes(written: WriteSummary) -> dict[str, object]:
             nonlocal report
@@ -96,8 +98,8 @@ def register_stage(
     return report
 
 
-def certified(report: Report, evidence: Evidence) -> Report:
+def certified(report: Report, verification: Verification) -> Report:
     """The report with its certificate and the warnings that this calls for."""
-    warnings = [*report.warnings, *evidence.warnings()]
-    certificate = evidence.certificate({w.code for w in warnings})
+    warnings = [*report.warnings, *verification.warnings()]
+    certificate = verification.certificate({w.code for w in warnings})
     return report.model_copy(update={"warnings": warnings, "certificate": certificate})

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from specimap_core.arrays import Bytes, Floats, Ints, Singles
 from specimap_core.geometry.cameras import Intrinsics, Pose
 from specimap_core.geometry.image_sampling import sample
-from specimap_core.surface.fusion import Mesh
 from specimap_core.surface.raycast import RayCaster
 
 CHUNK = 8192
@@ -94,31 +93,31 @@ class Contrasts:
 
 
 def choose_views(
-    mesh: Mesh, chosen: Ints, photographs: Photographs, most: int, least_cosine: float, *, workers: int = 1
+    caster: RayCaster, chosen: Ints, photographs: Photographs, most: int, least_cosine: float, *, workers: int = 1
 ) -> Ints:
-    """For each of the ``chosen`` (n,) vertices the photos that are compared there, (n, most), -1 where there are fewer:
-    those that see it most squarely and unhidden, and not in a highlight. Of the more oblique, some are left out,
-    so that the result can be checked with photos that did not make it.
+    """For each of the ``chosen`` (n,) vertices of the caster's mesh the photos that are compared there, (n, most), -1
+    where there are fewer: those that see it most squarely and unhidden, and not in a highlight. Of the more oblique,
+    some are left out, so that the result can be checked with photos that did not make it.
 
     Highlights move over the surface with the camera and lie where the lamp's mirror image is, below it: photos that
     agree on them agree on a wrong place.
     """
     looked_at = most + MOST_CHECKING + SPARE_BEFORE_HIGHLIGHTS
     views = np.empty((len(chosen), looked_at), np.int64)
-    caster = RayCaster(mesh)
 
     def run(part: slice) -> None:
-        views[part] = _most_frontal(caster, chosen[part], photographs, views.shape[1], least_cosine)
+        views[part] = frontal_views(caster, chosen[part], photographs, views.shape[1], least_cosine)
 
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(run, [slice(k, k + CHUNK) for k in range(0, len(chosen), CHUNK)]))
-    views[_highlights(mesh.vertices[chosen].astype(float), views, photographs)] = -1
+    views[_highlights(caster.mesh.vertices[chosen].astype(float), views, photographs)] = -1
     packed = np.take_along_axis(views, np.argsort(views < 0, axis=1, kind="stable"), 1)
     return np.delete(packed, CHECKING, axis=1)[:, :most]
 
 
-def _most_frontal(caster: RayCaster, chosen: Ints, photographs: Photographs, most: int, least_cosine: float) -> Ints:
-    """The photos that see each vertex most squarely and unhidden, (n, most); -1 where there are fewer."""
+def frontal_views(caster: RayCaster, chosen: Ints, photographs: Photographs, most: int, least_cosine: float) -> Ints:
+    """The photos that see each of the ``chosen`` (n,) vertices most squarely and unhidden, the most frontal first,
+    (n, most); -1 where there are fewer."""
     mesh, lens, poses = caster.mesh, photographs.lens, photographs.poses
     points, normals = mesh.vertices[chosen].astype(float), mesh.normals[chosen].astype(float)
     cosine = np.empty((len(poses), len(points)), np.float32)

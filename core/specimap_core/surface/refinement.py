@@ -38,13 +38,14 @@ from specimap_core.surface.photo_consistency import (
     agreement,
     choose_views,
 )
+from specimap_core.surface.raycast import RayCaster
 from specimap_core.surface.settings import Pass, RefineSettings
 
 LEAST_VIEWS = 3
 CHANCE = 1.2
 """Photos that have nothing in common hardly reach a correlation of so many standard deviations of one pixel's, which
 for k photos is the root of 2 / (k (k - 1)): a window holds some pixels, but the best of some offsets is taken."""
-HEIGHT_POWER = 0.4
+HEIGHT_POWER = 0.5
 """How sure a place is follows the curvature of the photos' agreement over this power of its height; 1 would be the
 width of its top. Gloss lowers the agreement by more than it makes a place unsure. Chosen with the shares of sigma."""
 MOST_WEIGHT = 5.0
@@ -113,7 +114,7 @@ def refine_mesh(
         done, share = sum(cost[:k]) / sum(cost), cost[k] / sum(cost)
         if views is None or one.choose_views:
             views = choose_views(
-                refined.mesh, chosen, photographs, settings.views, settings.least_cosine, workers=workers
+                RayCaster(refined.mesh), chosen, photographs, settings.views, settings.least_cosine, workers=workers
             )
         if one.finer:
             refined, chosen, views = _finer(refined, chosen, views)

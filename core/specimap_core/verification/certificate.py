@@ -65,7 +65,7 @@ DOUBTS = (
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class Verification:
     """What was checked of a result, and the ``sigma_mm`` (P,) that it stated at the places."""
 
     surface: SurfaceCheck
@@ -131,13 +131,13 @@ class Evidence:
         )
 
 
-def gather(
+def verify(
     registered: Registered,
     greys: tuple[NDArray[np.uint8], ...],
     cube: Cube,
     settings: RefineSettings,
     progress: Callable[[float], None] = lambda share: None,
-) -> Evidence:
+) -> Verification:
     """Check a registered result against the ``greys`` (H, W) of its photos and against the cube."""
     surface, camera, markers = registered.surface, registered.camera, registered.markers
     adjusted, caster = surface.adjusted, surface.caster
@@ -160,7 +160,7 @@ def gather(
     bands = check_bands(cube, markers.corners_px)
     progress(1.0)
     stated = float(np.median(sites.sigma_mm)) if len(sites.sigma_mm) else 0.0
-    return Evidence(of_surface, of_cube, bands, by_camera, stated)
+    return Verification(of_surface, of_cube, bands, by_camera, stated)
 
 
 def _checked_surface(sites: Sites, photographs: Photographs, caster: RayCaster) -> SurfaceCheck:

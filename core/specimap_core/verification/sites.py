@@ -9,14 +9,11 @@ from numpy.typing import NDArray
 
 from specimap_core.arrays import Floats, Ints
 from specimap_core.cloud import CloudPoints, Flag
-from specimap_core.surface.photo_consistency import Photographs, choose_views
+from specimap_core.surface.photo_consistency import Photographs, choose_views, frontal_views
 from specimap_core.surface.raycast import RayCaster
 from specimap_core.surface.settings import RefineSettings
 
 PLACES = 400
-MARGIN_PX = 8
-CLEARANCE_MM = 0.15, 0.4
-"""Along the normal and along the line of sight: hidden is what the mesh hides from farther out."""
 ABOVE_MM = 0.2
 
 
@@ -38,13 +35,21 @@ def sites_of(points: CloudPoints, caster: RayCaster, photographs: Photographs, s
     vertices, sigma = _spread(points, caster)
     mesh = caster.mesh
     place, normal = mesh.vertices[vertices].astype(float), mesh.normals[vertices].astype(float)
-    seen = visible(place, normal, photographs, caster, settings.least_cosine)
-    used = np.zeros_like(seen)
+    photos = len(photographs.poses)
+    used = seen = np.zeros((0, photos), bool)
     if len(vertices):
-        views = choose_views(mesh, vertices, photographs, settings.views, settings.least_cosine)
-        site, rank = np.nonzero(views >= 0)
-        used[site, views[site, rank]] = True
-    return Sites(place, normal, used & seen, seen, sigma)
+        least = settings.least_cosine
+        used = _named(choose_views(caster, vertices, photographs, settings.views, least), photos)
+        seen = _named(frontal_views(caster, vertices, photographs, photos, least), photos)
+    return Sites(place, normal, used, seen, sigma)
+
+
+def _named(views: Ints, photos: int) -> NDArray[np.bool_]:
+    """Which of the ``photos`` the rows of ``views`` (P, k) name: (P, photos)."""
+    named = np.zeros((len(views), photos), bool)
+    row, rank = np.nonzero(views >= 0)
+    named[row, views[row, rank]] = True
+    return named
 
 
 def tangents(normals: Floats) -> tuple[Floats, Floats]:
@@ -67,22 +72,3 @@ def _spread(points: CloudPoints, caster: RayCaster) -> tuple[Ints, Floats]:
     shares = np.column_stack([1 - hits.barycentric.sum(1), hits.barycentric])[met]
     vertices, first = np.unique(caster.mesh.triangles[hits.triangle[met], shares.argmax(1)], return_index=True)
     return vertices.astype(np.int64), points.sigma_mm[chosen[met[first]]].astype(float)
-
-
-def visible(
-    points: Floats, normals: Floats, photographs: Photographs, caster: RayCaster, least_cosine: float
-) -> NDArray[np.bool_]:
-    """Which photos see the points (P, 3) unhidden and no more obliquely than ``least_cosine``: (P, V)."""
-    lens = photographs.lens
-    seen = np.zeros((len(points), len(photographs.poses)), bool)
-    end = np.array([lens.width, lens.height]) - 1 - MARGIN_PX
-    for k, pose in enumerate(photographs.poses):
-        away = pose.centre - points
-        away /= np.linalg.norm(away, axis=1, keepdims=True)
-        cam = pose.apply(points)
-        pixels = lens.project(cam)
-        inside = (cam[:, 2] > 0) & (pixels > MARGIN_PX).all(1) & (pixels < end).all(1)
-        at = np.flatnonzero(inside & ((away * normals).sum(1) > least_cosine))
-        start = points[at] + CLEARANCE_MM[0] * normals[at] + CLEARANCE_MM[1] * away[at]
-        seen[at, k] = ~caster.cast(start, away[at]).hit
-    return seen

@@ -15,6 +15,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from specimap_core.errors import SettingsError
+from specimap_core.json_text import json_text
 from specimap_infra.backup.manifest import Cancelled
 from specimap_infra.database import Database, database_errors
 from specimap_infra.postgres import unhurried
@@ -62,7 +63,7 @@ def dump_rows(database: Database, target: Path, cancelled: Cancelled) -> Snapsho
                         return snapshot
                     snapshot.rows[table.name] += 1
                     values = {name: _stored(value) for name, value in row.items()}
-                    file.write(json.dumps([table.name, values], ensure_ascii=False, separators=(",", ":")) + "\n")
+                    file.write(json_text([table.name, values], ensure_ascii=False, separators=(",", ":")) + "\n")
                     if (found := reference_of(table.name, row)) is not None:
                         snapshot.references.append(found)
             return snapshot

@@ -13,6 +13,7 @@ from specimap_core.arrays import Floats
 from specimap_core.geometry.cameras import Intrinsics, Pose
 from specimap_core.surface.fusion import Mesh
 from specimap_core.surface.photo_consistency import (
+    CHECKING,
     HIGHLIGHT,
     LEAST_WITHOUT_HIGHLIGHTS,
     OWN_VARIANCE,
@@ -20,7 +21,9 @@ from specimap_core.surface.photo_consistency import (
     Photographs,
     agreement,
     choose_views,
+    frontal_views,
 )
+from specimap_core.surface.raycast import RayCaster
 
 LENS = Intrinsics.centred(240, 240, 480.0)
 CAMERAS = 10
@@ -75,7 +78,7 @@ def grid(z: float) -> Mesh:
 
 def chosen(plane: Photographs, z: float = 0.0, most: int = 6) -> NDArray[np.int64]:
     mesh = grid(z)
-    return choose_views(mesh, np.arange(len(mesh.vertices)), plane, most, 0.25)
+    return choose_views(RayCaster(mesh), np.arange(len(mesh.vertices)), plane, most, 0.25)
 
 
 def scores(plane: Photographs, points: Floats, views: NDArray[np.int64], offsets: Floats) -> Floats:
@@ -175,6 +178,20 @@ def test_views_come_packed_and_no_more_than_wanted(plane: Photographs) -> None:
         assert len(set(named.tolist())) == len(named)
 
 
+def test_some_of_the_more_oblique_photos_are_left_for_checking(plane: Photographs) -> None:
+    caster = RayCaster(grid(0.0))
+    vertices = np.arange(len(caster.mesh.vertices))
+    seen = frontal_views(caster, vertices, plane, CAMERAS, 0.25)
+    assert (np.sort(seen, axis=1) == np.arange(CAMERAS)).all()
+    compared = choose_views(caster, vertices, plane, CAMERAS, 0.25)
+    left = seen[:, CHECKING]
+    assert left.shape[1] == 1
+    for vertex in vertices:
+        named = compared[vertex][compared[vertex] >= 0].tolist()
+        assert named == np.delete(seen[vertex], CHECKING).tolist()
+        assert not set(named) & set(left[vertex].tolist())
+
+
 def test_more_vertices_than_one_look_up_takes(plane: Photographs) -> None:
     """A close-up shows tens of thousands in each photo."""
     side = np.linspace(-8, 8, 190)
@@ -184,7 +201,7 @@ def test_more_vertices_than_one_look_up_takes(plane: Photographs) -> None:
     normals = np.tile(UP, (len(x), 1))
     mesh = Mesh(vertices, few.triangles, normals.astype(np.float32), np.zeros(vertices.shape, np.uint8))
     assert len(x) > 32_767
-    views = choose_views(mesh, np.arange(len(x)), plane, 6, 0.25)
+    views = choose_views(RayCaster(mesh), np.arange(len(x)), plane, 6, 0.25)
     assert (views[:, :LEAST_WITHOUT_HIGHLIGHTS] >= 0).all()
     found = scores(plane, vertices.astype(float), views, np.array([0.0, 3.0]))
     assert 0.6 < np.median(found[:, 0]) < 1

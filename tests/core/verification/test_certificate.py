@@ -16,7 +16,7 @@ from specimap_core.geometry.cameras import Pose, rotation_from_vector
 from specimap_core.pipeline.artefacts import load_stage1
 from specimap_core.pipeline.outputs import Outputs
 from specimap_core.report.model import Report
-from specimap_core.surface.photo_consistency import Photographs
+from specimap_core.surface.photo_consistency import Photographs, frontal_views
 from specimap_core.surface.raycast import RayCaster
 from specimap_core.surface.refinement import pixel_footprint_mm
 from specimap_core.surface.regions import raised_mm
@@ -25,7 +25,7 @@ from specimap_core.verification.certificate import MOST_BAND_PX, MOST_LEAN_PX, M
 from specimap_core.verification.cube_picture import check_bands
 from specimap_core.verification.figures import Certificate, SurfaceCheck
 from specimap_core.verification.held_out import measure
-from specimap_core.verification.sites import Sites, visible
+from specimap_core.verification.sites import Sites
 from specimap_core.verification.surface_check import check_surface
 from specimap_validation.phantom import PhantomSettings
 from tests.support.moved_specimen import stage2_of
@@ -92,7 +92,8 @@ def checked(out: Path, *, focal: float = 1.0, lifted_mm: float = 0.0, turned: tu
     caster = RayCaster(mesh)
     photographs = Photographs([g.astype(np.float32) for g in stage1.greys], lens, poses)
     points, normals = mesh.vertices[chosen].astype(float), mesh.normals[chosen].astype(float)
-    seen = visible(points, normals, photographs, caster, 0.25)
+    views = frontal_views(caster, chosen, photographs, len(poses), 0.25)
+    seen = (views[:, :, None] == np.arange(len(poses))).any(1)
     # Every second photo predicts the others.
     sites = Sites(points, normals, seen & (np.arange(len(poses)) % 2 == 0), seen, np.ones(len(points)))
     return check_surface(sites, measure(sites, photographs, caster), pixel_footprint_mm(lens, poses, points.mean(0)))
