@@ -55,9 +55,9 @@ class Shares:
     pixel's reach, which a sideways error turns into height.
     """
 
-    of_width: float = 0.603
-    of_bend: float = 2.377
-    of_jump: float = 0.4023
+    of_width: float = 0.5958
+    of_bend: float = 2.404
+    of_jump: float = 0.4036
 
 
 SHARES = Shares()
