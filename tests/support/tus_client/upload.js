@@ -19,6 +19,10 @@ const upload = new tus.Upload(fs.createReadStream(file), {
     console.log(JSON.stringify({ error: String(error), answers }));
     process.exit(1);
   },
-  onSuccess: () => console.log(JSON.stringify({ url: upload.url, answers })),
+  onSuccess: () => {
+    console.log(JSON.stringify({ url: upload.url, answers }));
+    // A request that was answered before its body ended keeps its connection until the server gives that up.
+    process.exit(0);
+  },
 });
 upload.start();
