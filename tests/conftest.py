@@ -39,6 +39,7 @@ def data_dir() -> Path:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the modules that have slow tests: a long test that starts last leaves the other processes idle."""
-    slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+    """Begin with the modules that wait, then with those that have slow tests: what starts last leaves the other
+    processes idle, and while one waits, the others compute."""
+    slow, waiting = ({item.path for item in items if item.get_closest_marker(mark)} for mark in ("slow", "waits"))
+    items.sort(key=lambda item: (item.path not in waiting, item.path not in slow))

@@ -17,7 +17,7 @@ from tests.support.scenes import OnDisk
 from tests.support.serve_scene import running
 from tests.support.worker_scene import processes_of, until
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.waits]
 
 
 def test_first_start_tells_address_and_key_and_the_second_only_the_address(tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ from tests.support.worker_scene import QUICK, Shop, shop
 # ---- an empty machine ---------------------------------------------------------------------------------
 
 
+@pytest.mark.waits
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "other"), [("local", "local"), ("shared", "shared"), ("local", "shared")])
 def test_the_service_goes_on_from_a_backup_on_an_empty_machine(

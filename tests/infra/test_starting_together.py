@@ -32,6 +32,7 @@ migrate(Database.open(sys.argv[1]))
 """Alembic logs a line for each migration that it runs."""
 
 
+@pytest.mark.waits
 @pytest.mark.slow
 def test_programs_that_start_at_once_migrate_once(any_database: str) -> None:
     command = [sys.executable, "-c", STARTER, sqlalchemy_url(any_database)]

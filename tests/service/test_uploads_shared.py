@@ -106,6 +106,7 @@ def site(folder: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[S
         yield made
 
 
+@pytest.mark.waits
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["bucket", "folder"])
 def test_an_upload_goes_on_at_any_machine_and_outlives_them(

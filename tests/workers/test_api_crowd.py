@@ -21,7 +21,7 @@ from specimap_service.auth.keys import new_key
 from tests.support.scenes import Finished, OnDisk
 from tests.support.worker_scene import QUICK, Shop, assert_all_succeed, shop, until
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.waits]
 
 JOBS = 80
 KILLS = 6

@@ -20,7 +20,7 @@ from tests.support.scenes import Finished, OnDisk
 from tests.support.service_scene import serving
 from tests.support.worker_scene import QUICK, assert_all_succeed, shop, until
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.waits]
 
 JOBS = 30
 KILLS = 6

@@ -21,7 +21,7 @@ from specimap_workers.stage_process import SPARES
 from tests.support.scenes import Finished, OnDisk
 from tests.support.worker_scene import QUICK, STAGE_SCRIPT, Shop, processes_of, shop, until
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.waits]
 
 TAKEOVER_SECONDS = 20.0
 

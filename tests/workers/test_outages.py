@@ -28,7 +28,7 @@ from tests.support.serve_scene import running
 from tests.support.service_scene import serving
 from tests.support.worker_scene import QUICK, Shop, processes_of, shop, until
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.waits]
 
 LONG = os.environ.get("SPECIMAP_TEST_OUTAGE_SECONDS")
 SECONDS = dict.fromkeys(("shut", "hang"), float(LONG)) if LONG else {"shut": 4.0, "hang": 14.0}
