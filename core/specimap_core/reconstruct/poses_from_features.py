@@ -62,6 +62,7 @@ def pose_by_resection(
     # The specimen lies inside the layout, about a fifth of its size above the plane.
     target = corners.reshape(-1, 3).mean(0) + np.array([0, 0, 0.1 * np.ptp(corners[..., 0])])
     poses, open_photos = dict(certain), list(waiting)
+    locators: dict[str, Locator] = {}
     seen = [(photos[p], between_markers(lens, pose, corners, photos[p].size)) for p, pose in sorted(certain.items())]
     texture = in_words(usual_share(seen), "the picture between the markers")
     sentences = [f"{len(waiting)} of {len(photos)} photos were not posed by markers alone.", texture]
@@ -71,8 +72,11 @@ def pose_by_resection(
 
     def attempt(name: str, why: str, least_inliers: int = 0) -> None:
         before = len(open_photos)
-        kind = feature_kind(name, workers)
-        locator = Locator(photos, lens, poses, target, settings.seed, kind, tick, least_inliers=least_inliers)
+        if name not in locators:
+            kind = feature_kind(name, workers)
+            locators[name] = Locator(photos, lens, poses, target, settings.seed, kind, tick)
+        locator = locators[name]
+        locator.begin(poses, least_inliers)
         _resect_all(locator, open_photos, ambiguous)
         poses.update(locator.poses)
         found, placed = locator.feature_counts()

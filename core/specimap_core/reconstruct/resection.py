@@ -47,10 +47,7 @@ class ResectedPose:
 
 
 class Locator:
-    """Locates photos against those already posed. ``tick`` is called between steps and may raise to stop.
-
-    ``least_inliers``: how many matches must agree on a pose, where that is more than the kind of features asks for.
-    """
+    """Locates photos against those already posed. ``tick`` is called between steps and may raise to stop."""
 
     def __init__(
         self,
@@ -61,8 +58,6 @@ class Locator:
         seed: int,
         kind: FeatureKind,
         tick: Tick = lambda: None,
-        *,
-        least_inliers: int = 0,
     ) -> None:
         quiet_colmap()
         self._photos = photos
@@ -71,7 +66,7 @@ class Locator:
         self._seed = seed
         self._kind = kind
         self._tick = tick
-        self._least_inliers = max(kind.least_inliers, least_inliers)
+        self._least_inliers = kind.least_inliers
         self._features: dict[TurnedPhoto, Features] = {}
         self._turn: dict[int, int] = {}  # of posed photos that were found turned
         self._points: dict[int, Floats] = {}  # photo -> (N, 3), NaN where a feature has no place
@@ -79,6 +74,15 @@ class Locator:
         self._similarities: dict[tuple[TurnedPhoto, TurnedPhoto], int] = {}
         self._failed: dict[TurnedPhoto, list[int]] = {}  # what a photo was last compared with in vain
         self.poses = dict(poses)
+
+    def begin(self, poses: dict[int, Pose], least_inliers: int) -> None:
+        """Try anew, with what is known by now: photos described and matched before are not described again.
+
+        ``least_inliers``: how many matches must agree on a pose, where that is more than the kind of features asks for.
+        """
+        self.poses.update(poses)
+        self._least_inliers = max(self._kind.least_inliers, least_inliers)
+        self._failed.clear()
 
     def _extract(self, photos: Iterable[int], turn: int = 0) -> None:
         missing = [p for p in photos if (p, turn) not in self._features]
