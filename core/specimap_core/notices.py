@@ -111,6 +111,7 @@ CATALOGUE = MappingProxyType(
         ),
         "cube_corners_scatter": NoticeKind("result", "the cube's corners lie far from where its camera puts them"),
         "photos_contradict": NoticeKind("result", "photos show the specimen elsewhere than the other photos predict"),
+        "photo_contradicts": NoticeKind("result", "single photos show the specimen where the others do not predict it"),
         "photos_unpredicted": NoticeKind("result", "most of the photos do not resemble what the others predict"),
         "surface_leans": NoticeKind("result", "unused photos show the whole surface higher or lower"),
         "surface_unchecked": NoticeKind("result", "too few photos were left to check the surface with"),

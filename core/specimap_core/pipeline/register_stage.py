@@ -65,8 +65,9 @@ def register_stage(
         except MarkersMissingInCubeError as error:
             raise with_assumptions(error, cube.warnings) from error
         checked = REGISTERED_SHARE + CHECKED_SHARE
+        names = [stage1.names[p] for p in stage1.reconstruction.photos]
         verification = verify(
-            registered, stage1.greys, cube, settings.refine, within(progress, REGISTERED_SHARE, checked)
+            registered, stage1.greys, names, cube, settings.refine, within(progress, REGISTERED_SHARE, checked)
         )
         registered = replace(registered, points=verification.scaled(registered.points))
         adjusted = registered.surface.adjusted

@@ -40,7 +40,8 @@ def _rows(found: Certificate) -> Iterator[tuple[str, str, str, str]]:
         yield ("Registration", *_seen(registration.seen_mm), f"{registration.tiles} tiles of the cube's picture")
     yield ("Both together", *_seen(found.total_mm), f"stated sigma was multiplied by {found.sigma_factor:.2f}")
     if surface.photo_shift_px is not None:
-        yield ("Poses and lens", f"{surface.photo_shift_px:.3f} px", "", "RMS over the photos")
+        alone = f"; off by themselves: {', '.join(surface.photos_off)}" if surface.photos_off else ""
+        yield ("Poses and lens", f"{surface.photo_shift_px:.3f} px", "", f"RMS over the photos{alone}")
     if bands is not None:
         off = f"{bands.shift_px:.3f} px", f"{bands.growth_px:.3f} px"
         yield ("Bands: shift, growth", *off, f"{bands.blocks} blocks of the last third of the bands against the first")

@@ -79,6 +79,7 @@ WARNING_ADVICE = {
     "photo_outlying": "Look at the photos that are named: a card moved, or another lens. Take them again.",
     "cube_corners_scatter": "Record the cube again: all markers unmoved, sharp, and the sensor's pixels square.",
     "photos_contradict": "Take all photos again, touching neither specimen nor markers, with one lens and fixed focus.",
+    "photo_contradicts": "Leave out the photos that are named, or take them again, and repeat the run.",
     "photos_unpredicted": "Take the photos again, sharp, evenly lit and without glare; then repeat the run.",
     "surface_leans": "Take all photos again with one lens and fixed focus; check the edge of the markers.",
     "surface_unchecked": f"Take {RECOMMENDED_PHOTOS} or more photos from all around: some must be left for checking.",

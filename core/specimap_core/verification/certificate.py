@@ -6,7 +6,7 @@ judged on others: docs/accuracy.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,10 +47,12 @@ MOST_UNLIKE = 0.85
 MOST_TOTAL_MM = 0.2
 MOST_OF_CUBE_MM = 0.12
 MOST_BAND_PX = 0.1
+MOST_NAMED = 6
 BAND_SIGMAS = 5.0
 CONTRADICTED = ("photos_contradict", "surface_leans", "photos_unpredicted")
 """What these say puts everything in doubt: the result is not trusted."""
 DOUBTS = (
+    "photo_contradicts",
     "surface_unchecked",
     "seen_error_large",
     "cube_picture_off",
@@ -134,17 +136,18 @@ class Verification:
 def verify(
     registered: Registered,
     greys: tuple[NDArray[np.uint8], ...],
+    names: Sequence[str],
     cube: Cube,
     settings: RefineSettings,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Verification:
-    """Check a registered result against the ``greys`` (H, W) of its photos and against the cube."""
+    """Check a registered result against the cube and the ``greys`` (H, W) of its photos, which have ``names``."""
     surface, camera, markers = registered.surface, registered.camera, registered.markers
     adjusted, caster = surface.adjusted, surface.caster
     photographs = Photographs(list(greys), adjusted.lens, adjusted.poses[: len(greys)])
     sites = sites_of(registered.points, caster, photographs, settings)
     progress(0.3)
-    of_surface = _checked_surface(sites, photographs, caster)
+    of_surface = _checked_surface(sites, photographs, caster, names)
     progress(0.5)
     by_camera = registered.method == "camera"
     of_cube = None
@@ -163,7 +166,7 @@ def verify(
     return Verification(of_surface, of_cube, bands, by_camera, stated)
 
 
-def _checked_surface(sites: Sites, photographs: Photographs, caster: RayCaster) -> SurfaceCheck:
+def _checked_surface(sites: Sites, photographs: Photographs, caster: RayCaster, names: Sequence[str]) -> SurfaceCheck:
     if not sites.seen.any():
         return SurfaceCheck(
             places=len(sites.points),
@@ -177,7 +180,7 @@ def _checked_surface(sites: Sites, photographs: Photographs, caster: RayCaster) 
             pixel_mm=0.0,
         )
     pixel_mm = pixel_footprint_mm(photographs.lens, photographs.poses, sites.points.mean(0))
-    return check_surface(sites, measure(sites, photographs, caster), pixel_mm)
+    return check_surface(sites, measure(sites, photographs, caster), pixel_mm, names)
 
 
 def _of_surface(found: SurfaceCheck) -> list[Notice]:
@@ -185,6 +188,13 @@ def _of_surface(found: SurfaceCheck) -> list[Notice]:
     if found.photo_shift_px is not None and found.photo_shift_px > MOST_PHOTO_SHIFT_PX:
         text = f"Photos show the specimen {found.photo_shift_px:.1f} px (RMS) from where the other photos predict it."
         warnings.append(Notice("photos_contradict", text))
+    if found.photos_off:
+        more = f" and {len(found.photos_off) - MOST_NAMED} more" if len(found.photos_off) > MOST_NAMED else ""
+        text = (
+            "These photos do not show the specimen where the other photos predict it; their poses are wrong, something"
+            f" moved, or they were edited: {', '.join(found.photos_off[:MOST_NAMED])}{more}."
+        )
+        warnings.append(Notice("photo_contradicts", text))
     if found.lean_mm is not None and abs(found.lean_mm) > MOST_LEAN_PX * found.pixel_mm:
         where = "low" if found.lean_mm > 0 else "high"
         text = f"The whole surface seems to lie {abs(found.lean_mm):.2f} mm too {where}, as unused photos show it."

@@ -24,7 +24,8 @@ class SurfaceCheck(Section):
     ``offset_mm``: median distance along the normal by which the surface seems off, without the noise of measuring it,
     and ``lean_mm``, the median with its sign, by which all of it seems too low; ``seen_mm``: the error of points that
     this stands for, None where too few places were checked; ``photo_shift_px``: root mean square over the photos of
-    what displaces all patches of one together, in pixels of ``pixel_mm`` on the specimen.
+    what displaces all patches of one together, in pixels of ``pixel_mm`` on the specimen; ``photos_off``: those that
+    are off by themselves.
     """
 
     places: int
@@ -35,6 +36,7 @@ class SurfaceCheck(Section):
     lean_mm: Figure | None
     seen_mm: SeenError | None
     photo_shift_px: Figure | None
+    photos_off: tuple[str, ...] = ()
     pixel_mm: Figure
 
 

@@ -44,8 +44,8 @@ STEP_MM = 0.05
 class Displacements:
     """E patches, aligned: ``site`` (E,), ``photo`` (E,); by how much each is displaced, ``shift_mm`` (E, 2) along the
     site's tangents, with ``covariance`` (E, 2, 2); ``slope`` (E, 2): displacement for each mm by which the surface lies
-    too low; ``px_per_mm`` (E, 2, 2): from the tangents to the photo's pixels. ``unlike``: how many patches resemble no
-    prediction, highlights among them."""
+    too low; ``px_per_mm`` (E, 2, 2): from the tangents to the photo's pixels. ``tried`` (V,): patches of each photo
+    that were to be aligned; the others resemble no prediction, highlights among them."""
 
     site: Ints
     photo: Ints
@@ -53,7 +53,7 @@ class Displacements:
     covariance: Floats
     slope: Floats
     px_per_mm: Floats
-    unlike: int
+    tried: Ints
 
 
 @dataclass(frozen=True)
@@ -215,5 +215,5 @@ def _aligned(tested: _Patches, prediction: _Prediction, photographs: Photographs
         prediction.spread[site[good]] * (variance[good] / gain**2)[:, None, None],
         (tested.slope - prediction.slope[site])[good],
         tested.px_per_mm[good],
-        len(site) - len(good),
+        np.diff(tested.first),
     )

@@ -216,10 +216,14 @@ def test_the_cube_of_another_layout_is_refused(
 
 
 @pytest.mark.slow
-def test_a_photo_of_elsewhere_is_left_out_and_nothing_else_said(small: OnDisk, other: OnDisk, tmp_path: Path) -> None:
+def test_a_photo_of_elsewhere_is_left_out_and_a_sheared_one_named(small: OnDisk, other: OnDisk, tmp_path: Path) -> None:
     photos = copied(small.photos, tmp_path / "photos")
     shutil.copy(other.photos / "view_004.jpg", photos / "elsewhere.jpg")
     sheared(photos / "view_003.jpg", 10)
     found = ran(photos, small.header, tmp_path / "out")
     assert [r.name for r in found.photos.refused] == ["elsewhere.jpg"]
-    assert codes(found) <= {"few_photos", "markers_not_in_band_mean", "focal_breathing"}
+    assert codes(found) <= {"few_photos", "markers_not_in_band_mean", "focal_breathing", "photo_contradicts"}
+    assert found.certificate is not None
+    assert found.certificate.surface.photos_off == ("view_003.jpg",)
+    (named,) = [w.message for w in found.warnings if w.code == "photo_contradicts"]
+    assert "view_003.jpg" in named

@@ -79,12 +79,14 @@ def _stages(out: Path) -> tuple[Any, Any]:
     return stage1, stage2_of(out)
 
 
-def checked(out: Path, *, focal: float = 1.0, lifted_mm: float = 0.0, turned: tuple[int, ...] = ()) -> SurfaceCheck:
+def checked(
+    out: Path, *, focal: float = 1.0, lifted_mm: float = 0.0, turned: tuple[int, ...] = (), by: float = 0.0015
+) -> SurfaceCheck:
     """The check of a run's surface with its lens, its height or some of its poses changed afterwards."""
     stage1, stage2 = _stages(out)
     adjusted, mesh = stage2.adjusted, stage2.mesh
     lens = replace(adjusted.lens, focal_px=adjusted.lens.focal_px * focal)
-    aside = Pose(rotation_from_vector(np.array([0.0, 0.0015, 0.0])), np.zeros(3))
+    aside = Pose(rotation_from_vector(np.array([0.0, by, 0.0])), np.zeros(3))
     poses = tuple(aside @ p if k in turned else p for k, p in enumerate(adjusted.poses))
     raised = np.flatnonzero((mesh.vertices[:, 2] > raised_mm(adjusted.corners)) & (mesh.normals[:, 2] > 0.5))
     chosen = raised[:: max(1, len(raised) // 150)]
@@ -96,7 +98,8 @@ def checked(out: Path, *, focal: float = 1.0, lifted_mm: float = 0.0, turned: tu
     seen = (views[:, :, None] == np.arange(len(poses))).any(1)
     # Every second photo predicts the others.
     sites = Sites(points, normals, seen & (np.arange(len(poses)) % 2 == 0), seen, np.ones(len(points)))
-    return check_surface(sites, measure(sites, photographs, caster), pixel_footprint_mm(lens, poses, points.mean(0)))
+    pixel_mm = pixel_footprint_mm(lens, poses, points.mean(0))
+    return check_surface(sites, measure(sites, photographs, caster), pixel_mm, stage1.names)
 
 
 @pytest.mark.slow
@@ -125,6 +128,20 @@ def test_a_wrong_lens_and_wrong_poses_are_called(sharp: Finished) -> None:
     turned = checked(sharp.out, turned=(1, 3, 5))
     assert turned.photo_shift_px is not None
     assert turned.photo_shift_px > MOST_PHOTO_SHIFT_PX
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("by", [0.0015, 0.004, 0.03])
+def test_a_single_photo_with_a_wrong_pose_is_named(sharp: Finished, by: float) -> None:
+    """Off by one pixel, by some, and by so many that nothing is recognised any more."""
+    assert checked(sharp.out).photos_off == ()
+    stage1, _ = _stages(sharp.out)
+    for photo in (5, 9):
+        found = checked(sharp.out, turned=(photo,), by=by)
+        assert found.photos_off == (stage1.names[photo],)
+        # The others do not speak against all.
+        assert found.photo_shift_px is not None
+        assert found.photo_shift_px < MOST_PHOTO_SHIFT_PX
 
 
 @pytest.mark.slow
