@@ -135,7 +135,7 @@ class ServiceSettings(BaseSettings):
         description="Starts of one stage after which a job is failed whose process keeps ending by itself.",
     )
     interruptions: int = Field(
-        default=15,
+        default=30,
         ge=1,
         description="Times in one stage that a job's worker may die, or its process be killed from outside, before the job counts as the cause and is failed.",
     )
