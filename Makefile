@@ -13,7 +13,7 @@ STAMP := $(VENV)/.specimap-installed
 LEARNED := $(VENV)/.specimap-learned
 PATH_TRACED := $(VENV)/.specimap-path-traced
 DEMO_OUT ?= out/demo
-TEST_PROCESSES ?= 4
+TEST_PROCESSES ?= 3
 
 help:
 	@echo "make setup   install the pinned versions into $(VENV)"
