@@ -5,9 +5,16 @@ A report, a cube and a reconstruction carry theirs as ``warnings``. This module 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar, Literal
+
+
+def few_of(names: Sequence[str], most: int = 6) -> str:
+    """The first ``most`` names in a row, and how many more there are."""
+    shown = ", ".join(names[:most])
+    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from specimap_core.notices import few_of
 from specimap_core.report.blocks import Block, Callout, Level, Table
 from specimap_core.report.wording import WARNING_ADVICE, mm
 from specimap_core.verification.figures import Certificate, SeenError
@@ -40,7 +41,7 @@ def _rows(found: Certificate) -> Iterator[tuple[str, str, str, str]]:
         yield ("Registration", *_seen(registration.seen_mm), f"{registration.tiles} tiles of the cube's picture")
     yield ("Both together", *_seen(found.total_mm), f"stated sigma was multiplied by {found.sigma_factor:.2f}")
     if surface.photo_shift_px is not None:
-        alone = f"; off by themselves: {', '.join(surface.photos_off)}" if surface.photos_off else ""
+        alone = f"; off by themselves: {few_of(surface.photos_off)}" if surface.photos_off else ""
         yield ("Poses and lens", f"{surface.photo_shift_px:.3f} px", "", f"RMS over the photos{alone}")
     if bands is not None:
         off = f"{bands.shift_px:.3f} px", f"{bands.growth_px:.3f} px"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from specimap_core.notices import few_of
 from specimap_core.photos.reading import RECOMMENDED_PHOTOS
 from specimap_core.report.blocks import Level
 from specimap_core.report.model import Report
@@ -180,7 +181,7 @@ def checks(report: Report) -> list[Check]:
             f"{len(photos.used)} of {photos.given}",
             f"all but {MOST_REFUSED}",
             refused <= MOST_REFUSED,
-            "Take the photos that were not used again: " + _listed([r.name for r in photos.refused]) + ".",
+            "Take the photos that were not used again: " + few_of([r.name for r in photos.refused]) + ".",
         ),
         Check(
             "Markers in the cube",
@@ -189,14 +190,14 @@ def checks(report: Report) -> list[Check]:
             len(in_cube) >= 4 if of_a_board else not missing,
             "Record the cube again with four or more markers in view, lit and uncovered."
             if of_a_board
-            else f"Record the cube again with marker {_listed([str(i) for i in missing])} in view, lit and uncovered.",
+            else f"Record the cube again with marker {few_of([str(i) for i in missing])} in view, lit and uncovered.",
         ),
         Check(
             "Corners in the photos",
             f"{rms:.2f} px" + (f"; {len(off)} photo{'s' * (len(off) != 1)} off" if off else ""),
             f"{corner_limit_px(report):.1f} px or less, no photo far off",
             rms <= corner_limit_px(report) and not off,
-            f"Look at {_listed([o.name for o in off])}: a card moved in between, or it is of another lens."
+            f"Look at {few_of([o.name for o in off])}: a card moved in between, or it is of another lens."
             if off
             else "Take all photos again with one lens, touching neither markers nor specimen in between.",
         ),
@@ -289,8 +290,3 @@ def _rounded(value: float) -> str:
         return "0"
     digits = max(0, -math.floor(math.log10(value)))
     return f"{value:.{digits}f}"
-
-
-def _listed(names: list[str], most: int = 6) -> str:
-    shown = ", ".join(names[:most])
-    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"

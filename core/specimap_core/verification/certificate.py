@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from specimap_core.cloud import CloudPoints, Flag
 from specimap_core.cube import Cube
-from specimap_core.notices import Notice
+from specimap_core.notices import Notice, few_of
 from specimap_core.register.motion_repair import moved_mesh
 from specimap_core.register.registration import Registered
 from specimap_core.register.tile_offsets import measure_tile_offsets
@@ -47,7 +47,6 @@ MOST_UNLIKE = 0.85
 MOST_TOTAL_MM = 0.2
 MOST_OF_CUBE_MM = 0.12
 MOST_BAND_PX = 0.1
-MOST_NAMED = 6
 BAND_SIGMAS = 5.0
 CONTRADICTED = ("photos_contradict", "surface_leans", "photos_unpredicted")
 """What these say puts everything in doubt: the result is not trusted."""
@@ -189,10 +188,9 @@ def _of_surface(found: SurfaceCheck) -> list[Notice]:
         text = f"Photos show the specimen {found.photo_shift_px:.1f} px (RMS) from where the other photos predict it."
         warnings.append(Notice("photos_contradict", text))
     if found.photos_off:
-        more = f" and {len(found.photos_off) - MOST_NAMED} more" if len(found.photos_off) > MOST_NAMED else ""
         text = (
             "These photos do not show the specimen where the other photos predict it; their poses are wrong, something"
-            f" moved, or they were edited: {', '.join(found.photos_off[:MOST_NAMED])}{more}."
+            f" moved, or they were edited: {few_of(found.photos_off)}."
         )
         warnings.append(Notice("photo_contradicts", text))
     if found.lean_mm is not None and abs(found.lean_mm) > MOST_LEAN_PX * found.pixel_mm:

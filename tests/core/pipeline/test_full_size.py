@@ -47,7 +47,7 @@ def test_photos_of_a_phones_size_are_as_accurate(large: Judged, as_they_were: Ju
     assert 0.98 < large.errors.coverage <= 1
     assert abs(large.errors.scale) < 0.001
     assert 0.6 < large.within(1) < 0.85
-    assert large.within(2) < 0.99
+    assert 0.88 < large.within(2) < 0.99
 
 
 def test_twice_what_is_stated_holds_most_errors(large: Judged, request: pytest.FixtureRequest) -> None:
