@@ -1,0 +1,58 @@
+import { render } from "preact";
+import { useEffect } from "preact/hooks";
+import { registerSW } from "virtual:pwa-register";
+import { signal } from "@preact/signals";
+import { CurrentPage } from "./app/pages";
+import { path } from "./app/route";
+import { findSession, session, sessionProblem } from "./app/session";
+import { Shell } from "./app/shell";
+import { language } from "./i18n";
+import { t } from "./i18n/common";
+import { SharedPage } from "./signin/shared-page";
+import { SignInPage } from "./signin/sign-in-page";
+import { Guarded, Loading, ProblemBox } from "./ui/boxes";
+import "./ui/styles.css";
+
+const waiting = signal<(() => void) | null>(null);
+const update = registerSW({
+  onNeedRefresh() {
+    waiting.value = () => void update(true);
+  },
+});
+
+function App() {
+  useEffect(() => void findSession(), []);
+  useEffect(() => {
+    document.documentElement.lang = language.value;
+  }, [language.value]);
+  return (
+    <Shell>
+      {waiting.value && (
+        <div class="box" role="status">
+          {t("newVersion")}{" "}
+          <button type="button" onClick={waiting.value}>
+            {t("reload")}
+          </button>
+        </div>
+      )}
+      <Guarded key={path.value.join("/")}>
+        <Content />
+      </Guarded>
+    </Shell>
+  );
+}
+
+function Content() {
+  if (path.value[0] === "shared") return <SharedPage token={path.value[1] ?? ""} />;
+  if (session.value === undefined) {
+    return sessionProblem.value ? (
+      <ProblemBox problem={sessionProblem.value} again={() => void findSession()} />
+    ) : (
+      <Loading />
+    );
+  }
+  return session.value === null ? <SignInPage /> : <CurrentPage />;
+}
+
+const root = document.getElementById("app");
+if (root) render(<App />, root);
