@@ -1,7 +1,7 @@
 import { render } from "preact";
 import { useEffect } from "preact/hooks";
 import { registerSW } from "virtual:pwa-register";
-import { signal } from "@preact/signals";
+import { effect, signal } from "@preact/signals";
 import { CurrentPage } from "./app/pages";
 import { path } from "./app/route";
 import { findSession, session, sessionProblem } from "./app/session";
@@ -13,6 +13,10 @@ import { SignInPage } from "./signin/sign-in-page";
 import { Guarded, Loading, ProblemBox } from "./ui/boxes";
 import "./ui/styles.css";
 
+effect(() => {
+  document.documentElement.lang = language.value;
+});
+
 const waiting = signal<(() => void) | null>(null);
 const update = registerSW({
   onNeedRefresh() {
@@ -22,9 +26,6 @@ const update = registerSW({
 
 function App() {
   useEffect(() => void findSession(), []);
-  useEffect(() => {
-    document.documentElement.lang = language.value;
-  }, [language.value]);
   return (
     <Shell>
       {waiting.value && (

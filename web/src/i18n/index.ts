@@ -44,7 +44,7 @@ export function texts<T extends Record<string, string>>(tables: {
   it: { [K in keyof T]: string };
 }): (key: keyof T, values?: Values) => string {
   return (key, values = {}) => {
-    const forms = (tables[language.value][key] ?? tables.en[key] ?? String(key)).split("|");
+    const forms = tables[language.value][key].split("|");
     const form = (forms.length > 1 && values.n !== 1 ? forms[1] : forms[0]) ?? "";
     return form.replace(/\{(\w+)\}/g, (whole, name: string) => String(values[name] ?? whole));
   };

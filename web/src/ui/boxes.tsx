@@ -39,7 +39,7 @@ export function ProblemBox({ problem, again }: { problem: Problem; again?: (() =
 
 /** Show what went wrong in a part of the page instead of an empty one. */
 export function Guarded({ children }: { children: ComponentChildren }) {
-  const [error, reset] = useErrorBoundary();
+  const [error, reset] = useErrorBoundary() as [unknown, () => void];
   if (error === undefined) return <>{children}</>;
   return <ProblemBox problem={asProblem(error)} again={reset} />;
 }
