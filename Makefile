@@ -4,7 +4,7 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup learned path-traced demo test test-fast lint bench bench-service check-images clean
+.PHONY: help setup pages learned path-traced demo test test-pages test-fast lint bench bench-service check-images clean
 
 PYTHON ?= python3
 VENV := .venv
@@ -12,23 +12,31 @@ RUN := $(VENV)/bin
 STAMP := $(VENV)/.specimap-installed
 LEARNED := $(VENV)/.specimap-learned
 PATH_TRACED := $(VENV)/.specimap-path-traced
+WEB_PACKAGES := web/node_modules/.specimap-installed
+PAGES := service/specimap_service/pages/index.html
+PAGE_SOURCES := $(shell find web/src web/public web/index.html web/vite.config.ts web/tsconfig.json -type f ! -name contract.d.ts)
+# Node comes from requirements.lock, whatever else the machine has.
+NPM := PATH="$(CURDIR)/$(RUN):$$PATH" npm --prefix web
 DEMO_OUT ?= out/demo
 TEST_PROCESSES ?= 3
 
 help:
-	@echo "make setup   install the pinned versions into $(VENV)"
+	@echo "make setup   install the pinned versions into $(VENV), and build the web pages"
 	@echo "make learned add PyTorch and the learned features"
 	@echo "make path-traced add Mitsuba, for path-traced phantoms"
 	@echo "make demo    set up, then run samples/ through a service of its own into $(DEMO_OUT)"
 	@echo "make test    set up, with the learned features, then run all tests"
+	@echo "make test-pages   the tests of the web pages that need no service"
 	@echo "make test-fast   the same without the tests marked slow"
 	@echo "make lint    formatting (ruff format .), ruff and mypy"
 	@echo "make bench   measure time, memory and accuracy of a run"
 	@echo "make bench-service   measure the service beside nginx and PostgreSQL where they are, and kill its processes"
 	@echo "make check-images    build and run the images of docker/ without Docker (needs root and the network)"
-	@echo "make clean   remove $(VENV) and out/"
+	@echo "make clean   remove $(VENV), web/node_modules, the built pages and out/"
 
-setup: $(STAMP)
+setup: $(STAMP) pages
+
+pages: $(PAGES)
 
 $(RUN)/python:
 	@command -v "$(PYTHON)" >/dev/null || { echo "There is no $(PYTHON). Install Python 3.11 or later: sudo apt install python3 python3-venv" >&2; exit 1; }
@@ -44,6 +52,16 @@ $(STAMP): pyproject.toml client/pyproject.toml requirements.lock | $(RUN)/python
 	@$(RUN)/python -m pip install --quiet --disable-pip-version-check --requirement requirements.lock
 	@$(RUN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable . --editable client
 	@touch $@
+
+$(WEB_PACKAGES): web/package.json web/package-lock.json web/.npmrc $(STAMP)
+	@echo "Installing the packages of the web pages into web/node_modules"
+	@$(NPM) ci --silent || { \
+		echo "The packages of the web pages could not be fetched from $$($(NPM) config get registry). To name a mirror: make setup npm_config_registry=https://..." >&2; exit 1; }
+	@touch $@
+
+$(PAGES): $(PAGE_SOURCES) openapi.yaml $(WEB_PACKAGES)
+	@echo "Building the web pages"
+	@$(NPM) run --silent build -- --logLevel warn
 
 learned: $(LEARNED)
 
@@ -65,13 +83,17 @@ demo: setup
 	$(RUN)/specimap demo --out $(DEMO_OUT)
 
 # More processes than cores: many tests wait for servers, leases and clocks.
-test: setup learned
+test: setup learned test-pages
 	$(RUN)/python -m pytest -n $(TEST_PROCESSES) --dist worksteal
+
+test-pages: setup
+	$(NPM) test --silent
 
 test-fast: setup learned
 	$(RUN)/python -m pytest -n $(TEST_PROCESSES) --dist worksteal -m "not slow"
 
 lint: setup
+	$(NPM) run --silent lint
 	$(RUN)/ruff format --check .
 	$(RUN)/ruff check .
 	$(RUN)/mypy
@@ -87,4 +109,4 @@ check-images:
 	docker/check_images.sh
 
 clean:
-	rm -rf $(VENV) out
+	rm -rf $(VENV) out web/node_modules service/specimap_service/pages
