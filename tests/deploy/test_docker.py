@@ -156,7 +156,9 @@ def test_builder_is_sent_what_the_images_copy_and_no_more() -> None:
         if word == "COPY" and "--from" not in rest
         for source in rest.split()[:-1]
     }
-    assert copied == sent
+    # Files of a folder that is sent whole may be copied before the rest of it.
+    early = {source for source in copied if source.partition("/")[0] in sent - {source}}
+    assert copied - early == sent
     assert all((ROOT / name).exists() for name in sent)
 
 
