@@ -39,6 +39,7 @@ from specimap_infra.tables import (
     LabelVersion,
     Lease,
     RepeatableRequest,
+    SignIn,
     Upload,
 )
 
@@ -54,6 +55,8 @@ LEFTOVER = re.compile(r"^(?:[0-9a-f]{32}|label-[0-9a-f]{32}(?:\.body)?|exp_[\w-]
 AUDITED_AS = "service"
 REQUEST_DAYS = 7.0
 """How long a request with an idempotency key may be sent again: longer than a tablet is without a network."""
+SESSION_DAYS = 1.0
+"""How long the row of a session outlives it."""
 ENDED_WORKFLOWS = ["SUCCESS", "ERROR", "CANCELLED", "MAX_RECOVERY_ATTEMPTS_EXCEEDED"]
 
 Batch = Callable[[datetime.datetime], int]
@@ -99,6 +102,7 @@ class Housekeeping:
             "deliveries": (s.keep_delivery_days, self._deliveries),
             "audit": (s.keep_audit_days, self._audit),
             "requests": (REQUEST_DAYS, self._requests),
+            "sessions": (SESSION_DAYS, self._sessions),
         }
         removed = dict.fromkeys([*rules, "leftovers"], 0)
         for name, (days, batch) in rules.items():
@@ -176,6 +180,9 @@ class Housekeeping:
             some = sa.select(*name).where(RepeatableRequest.created_at < before).limit(BATCH)
             gone = sa.delete(RepeatableRequest).where(sa.tuple_(*name).in_(some))
             return rows_changed(session.execute(gone.execution_options(synchronize_session=False)))
+
+    def _sessions(self, before: datetime.datetime) -> int:
+        return self._rows(SignIn.id, SignIn.expires_at < before)
 
     def _rows(self, id: InstrumentedAttribute[str] | InstrumentedAttribute[int], rule: sa.ColumnElement[bool]) -> int:
         with self._database.session() as session:
@@ -259,6 +266,7 @@ def count_rows(session: Session) -> dict[str, int]:
         "labels": LabelVersion.__table__,
         "leases": Lease.__table__,
         "requests": RepeatableRequest.__table__,
+        "sessions": SignIn.__table__,
         "uploads": Upload.__table__,
         "workflows": sa.table("workflow_status", schema=engine_schema(session.get_bind().dialect)),
     }

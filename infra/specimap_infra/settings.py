@@ -65,6 +65,9 @@ class ServiceSettings(BaseSettings):
     rate_per_minute: int = Field(
         default=6000, ge=1, description="Requests a minute that a key may make, unless the key says otherwise."
     )
+    session_hours: float = Field(
+        default=12, gt=0, le=720, description="Hours after which a person who signed in on a page signs in again."
+    )
     max_connections: int = Field(
         default=1000, ge=1, description="Connections that the API takes at a time; it raises its limit of open files."
     )

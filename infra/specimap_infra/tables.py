@@ -99,6 +99,20 @@ class ApiKey(Base):
     quota_bytes: Mapped[int | None] = mapped_column(sa.BigInteger)
 
 
+class SignIn(Base):
+    """A session of a person who signed in with a key on a page; only the hash of its token is kept."""
+
+    __tablename__ = "sessions"
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    """SHA-256 of the token that the browser holds as a cookie."""
+    key_id: Mapped[str] = _owned_by("api_keys")
+    share_id: Mapped[str | None] = mapped_column(index=True)
+    """The share whose link made it: it sees that share's cloud alone."""
+    created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now)
+    expires_at: Mapped[datetime.datetime] = mapped_column(index=True)
+
+
 class Acquisition(Base):
     """An acquisition: the captures of one specimen. Its files, jobs and results belong to its project too."""
 

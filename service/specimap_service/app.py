@@ -16,7 +16,7 @@ from specimap_service.acquisitions import dependencies as acquisitions
 from specimap_service.acquisitions import file_routes
 from specimap_service.acquisitions import routes as acquisition_routes
 from specimap_service.auth import dependencies as auth
-from specimap_service.auth import project_routes
+from specimap_service.auth import project_routes, session_routes
 from specimap_service.auth import routes as key_routes
 from specimap_service.body_limits import BodyLimits
 from specimap_service.clouds import dependencies as clouds
@@ -39,7 +39,8 @@ from specimap_service.uploads import routes as upload_routes
 
 DESCRIPTION = """\
 Photos and one hyperspectral cube of an excised specimen to a metric 3D point cloud in which every point carries its
-spectrum. Every call but `/healthz` and `/readyz` takes a key: `Authorization: Bearer spk_…`. Errors are
+spectrum. Every call but `/healthz` and `/readyz` takes a key: `Authorization: Bearer spk_…`; on the service's own pages
+a person signs in with one instead. Errors are
 `application/problem+json` with a stable code and advice. HEAD works wherever GET does. A query parameter that an
 operation does not know is refused. Within `/v1` the contract only grows.
 """
@@ -50,6 +51,7 @@ ROUTES = (
     health,
     project_routes,
     key_routes,
+    session_routes,
     acquisition_routes,
     form_routes,
     file_routes,

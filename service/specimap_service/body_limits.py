@@ -16,6 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from specimap_core.errors import SpecimapError
 from specimap_infra.logs import logger
+from specimap_service.auth.credentials import check_page
 from specimap_service.auth.dependencies import PRINCIPAL, authenticated
 from specimap_service.errors import PayloadTooLargeError, RequestInvalidError
 from specimap_service.fair_turns import FairTurns
@@ -27,6 +28,9 @@ LARGEST_JSON = 64 * 1024
 """Settings of a job, an acquisition, a key: a hundred times what they need."""
 LARGEST_SELECTION = 4 * MIB
 """A page of points by number or by pixel: 100,000 of them, with spare bytes for blanks."""
+LARGEST_SIGN_IN = 4 * 1024
+"""The one body that is read without a key: it holds the key."""
+SIGN_IN = ("POST", "/v1/session")
 MOST_FIELDS = 1000
 """More than the names in a selection: each unknown one would be listed in the answer, which takes time."""
 MOST_PARTS = 4000
@@ -46,26 +50,30 @@ def most_bytes(method: str, path: str) -> int | None:
     """Return the bytes that a request's body may have; None where its route sets limits of its own."""
     if any(method == known and pattern.fullmatch(path) for known, pattern in FILES):
         return None
+    if (method, path) == SIGN_IN:
+        return LARGEST_SIGN_IN
     selection = any(method == known and pattern.fullmatch(path) for known, pattern in SELECTIONS)
     return LARGEST_SELECTION if selection else LARGEST_JSON
 
 
 class BodyLimits:
     """Middleware that checks the key before a byte of the body is read, and refuses bodies beyond their limit: by their
-    Content-Length, or else as they arrive."""
+    Content-Length, or else as they arrive. Where a person signs in, it checks which page asks."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on, or answer 401, 413 or 429."""
+        """Pass the request on, or answer 401, 403, 413 or 429."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
         request = Request(scope)
         limit = most_bytes(scope["method"], scope["path"])
         try:
-            if scope["method"] not in WITHOUT_BODY:
+            if (scope["method"], scope["path"]) == SIGN_IN:
+                check_page(request)
+            elif scope["method"] not in WITHOUT_BODY:
                 scope[PRINCIPAL] = await authenticated(request)
             size = request.headers.get("content-length", "0")
             if limit is not None and size.isdecimal() and int(size) > limit:
@@ -92,7 +100,7 @@ class BodyLimits:
             parts += body.count(b":") + body.count(b",")
             if received > limit:
                 refusal = _too_large(limit)
-            elif limit == LARGEST_JSON and parts > MOST_PARTS:
+            elif limit in (LARGEST_JSON, LARGEST_SIGN_IN) and parts > MOST_PARTS:
                 refusal = _too_many()
             if refusal is not None:
                 raise refusal

@@ -6,7 +6,7 @@ from specimap_core.errors import SpecimapError
 
 
 class UnauthorizedError(SpecimapError, PermissionError):
-    """No key, or one that is unknown, expired or revoked."""
+    """No key, or one that is unknown, expired or revoked; or a session that has ended."""
 
     code = "unauthorized"
 
@@ -15,6 +15,12 @@ class ForbiddenError(SpecimapError, PermissionError):
     """The key is valid but lacks the scope; ``details['scope']`` names it."""
 
     code = "forbidden"
+
+
+class CrossSiteRequestError(SpecimapError, PermissionError):
+    """A request with a session's cookie that may come from the page of another site."""
+
+    code = "cross_site_request"
 
 
 class RateLimitedError(SpecimapError, RuntimeError):

@@ -54,6 +54,7 @@ HTTP_STATUS: dict[type[SpecimapError], int] = {
     infra.WorkerCrashedError: 500,
     service.ChecksumInvalidError: 400,
     service.ChecksumMismatchError: 460,
+    service.CrossSiteRequestError: 403,
     service.ForbiddenError: 403,
     service.IdempotencyConflictError: 409,
     service.MediaTypeError: 415,

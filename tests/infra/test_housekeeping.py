@@ -17,6 +17,7 @@ from specimap_infra import housekeeping, jobs
 from specimap_infra.database import Database, utc_now
 from specimap_infra.housekeeping import Housekeeping, count_rows
 from specimap_infra.ids import new_id
+from specimap_infra.projects import DEFAULT_PROJECT
 from specimap_infra.queue import JOBS, RUN_JOB, enqueue, queue_client
 from specimap_infra.schema_version import engine_schema
 from specimap_infra.settings import load_settings
@@ -30,8 +31,10 @@ from specimap_infra.tables import (
     JobEvent,
     LabelVersion,
     RepeatableRequest,
+    SignIn,
     Upload,
 )
+from specimap_service.auth.keys import new_key
 from tests.support.job_scene import EXECUTOR, acquisition, queued_job
 from tests.support.result_scene import put_label, put_result
 from tests.support.service_scene import Running
@@ -101,6 +104,20 @@ def test_names_of_requests_go_once_they_may_not_be_sent_again(tables: Database, 
     with tables.session() as session:
         assert session.scalars(sa.select(RepeatableRequest.name)).all() == ["newer"]
         assert count_rows(session)["requests"] == 1
+
+
+def test_sessions_go_a_day_after_their_end(tables: Database, store: Storage) -> None:
+    limit = utc_now() - datetime.timedelta(days=housekeeping.SESSION_DAYS)
+    key, _ = new_key("tablet", ["read"], project_id=DEFAULT_PROJECT)
+    with tables.session() as session:
+        session.add(key)
+    with tables.session() as session:
+        for name, minutes in (("older", -1), ("newer", 1)):
+            session.add(SignIn(id=name, key_id=key.id, expires_at=limit + datetime.timedelta(minutes=minutes)))
+        assert count_rows(session)["sessions"] == 2
+    assert keeper(tables, store, **NEVER).sweep()["sessions"] == 1
+    with tables.session() as session:
+        assert session.scalars(sa.select(SignIn.id)).all() == ["newer"]
 
 
 def test_history_of_ended_jobs_goes_and_that_of_others_stays(tables: Database, store: Storage) -> None:

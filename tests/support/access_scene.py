@@ -112,11 +112,11 @@ Given = Callable[[World], dict[str, Any]]
 class Case:
     """A request that succeeds for a key with the scope in the objects' project.
 
-    ``given``: arguments of the request. ``aims``: whether it names an object. ``spare``: on the spare objects.
-    ``ends``: it deletes something, so it comes last.
+    ``scope``: None where every key will do. ``given``: arguments of the request. ``aims``: whether it names an object.
+    ``spare``: on the spare objects. ``ends``: it deletes something, so it comes last.
     """
 
-    scope: str
+    scope: str | None
     status: int = 200
     given: Given = field(default=lambda _: {})
     aims: bool = False
@@ -167,6 +167,8 @@ CASES: dict[tuple[str, str], Case] = {
     ("GET", "/v1/audit"): Case("admin"),
     ("GET", "/v1/keys"): Case("admin"),
     ("POST", "/v1/keys"): Case("admin", 201, _json(name="x", scopes=["read"])),
+    ("GET", "/v1/session"): Case(None),
+    ("DELETE", "/v1/session"): Case(None, 204),
     ("GET", "/v1/projects"): Case("read"),
     ("POST", "/v1/projects"): Case("admin", 201, _names),
     ("GET", "/v1/projects/{project_id}"): _read(),

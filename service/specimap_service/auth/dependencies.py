@@ -1,4 +1,4 @@
-"""Authentication of requests: the key, its rate limit, its scopes."""
+"""Authentication of requests: the key or the session, the key's rate limit, its scopes."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import Annotated
 import structlog
 from fastapi import Depends, FastAPI, Request
 from fastapi.concurrency import run_in_threadpool
-from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
 
 from specimap_infra.errors import DatabaseUnavailableError
 from specimap_service.app_state import AppState
 from specimap_service.auth.access import Access
+from specimap_service.auth.credentials import COOKIE, PAGE_HEADER, Credential, credential_of
 from specimap_service.auth.keys import KEPT_SECONDS, Keyring, Principal
 from specimap_service.auth.rate_limit import Left, RateLimiter
 from specimap_service.context import ANSWER_HEADERS, AppContext
@@ -45,15 +46,20 @@ async def authenticated(request: Request) -> Principal:
 
     Raises:
         UnauthorizedError: there is no key, or no valid one. RateLimitedError: too many requests, or wrong keys.
+        CrossSiteRequestError: it has a session's cookie, and may come from the page of another site.
         DatabaseUnavailableError: keys cannot be looked up.
     """
+    return await known_by(request, credential_of(request))
+
+
+async def known_by(request: Request, credential: Credential) -> Principal:
+    """Return the principal of a credential that a request presents; counts and raises as :func:`authenticated`."""
     keyring, limiter = KEYRING.of(request.app), LIMITER.of(request.app)
-    key = key_of(request)
     try:
-        found = keyring.trusted(key)
+        found = keyring.trusted(credential)
         if found is None:
             # A thread costs as much as the rest of a short request, so it is taken only to ask the database.
-            found = await run_in_threadpool(keyring.principal, key)
+            found = await run_in_threadpool(keyring.principal, credential)
     except UnauthorizedError:
         address = request.client.host if request.client else "unknown"
         limiter.take(f"address:{address}", FAILURES_PER_MINUTE)
@@ -69,39 +75,40 @@ async def authenticated(request: Request) -> Principal:
     return found
 
 
-def key_of(request: Request) -> str:
-    """Return the key that a request presents. Raises UnauthorizedError where there is none."""
-    kind, _, key = request.headers.get("authorization", "").partition(" ")
-    if kind.lower() != "bearer" or not key.strip():
-        raise UnauthorizedError("There is no key.", advice="Send it as `Authorization: Bearer <key>`.")
-    return key.strip()
-
-
 def trust_of(request: Request) -> Callable[[], Awaitable[float | None]]:
-    """Make a check for answers that last: the seconds for which the request's key is trusted, None where it no longer
-    is. A key that cannot be looked up keeps its trust."""
-    keyring, key = KEYRING.of(request.app), key_of(request)
+    """Make a check for answers that last: the seconds for which the request's key or session is trusted, None where it
+    no longer is. One that cannot be looked up keeps its trust."""
+    keyring, credential = KEYRING.of(request.app), credential_of(request)
 
     async def seconds() -> float | None:
-        left = keyring.trusted_seconds(key)
+        left = keyring.trusted_seconds(credential)
         if left > 0:
             return left
         try:
-            await run_in_threadpool(keyring.principal, key)
+            await run_in_threadpool(keyring.principal, credential)
         except UnauthorizedError:
             return None
         except DatabaseUnavailableError:
             return KEPT_SECONDS
-        return keyring.trusted_seconds(key)
+        return keyring.trusted_seconds(credential)
 
     return seconds
 
 
 _bearer = HTTPBearer(auto_error=False, scheme_name="key", description="`Authorization: Bearer spk_…`")
+_cookie = APIKeyCookie(
+    name=COOKIE,
+    auto_error=False,
+    scheme_name="session",
+    description="The cookie that `POST /v1/session` sets, for the service's own pages. It counts where there is no "
+    f"key. Requests that change something have the header `{PAGE_HEADER}: 1` with it.",
+)
 
 
 async def known_principal(
-    request: Request, _: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
+    request: Request,
+    _: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
+    __: Annotated[str | None, Depends(_cookie)],
 ) -> Principal:
     """Return the request's principal: a dependency. What others need of it counts as one request."""
     # Already known where the request may have a body, which is not read before.

@@ -14,11 +14,12 @@ from specimap_infra.database import utc_now
 from specimap_infra.projects import found_project
 from specimap_infra.tables import ApiKey, AuditEntry
 from specimap_service.auth.access import in_sight, load
-from specimap_service.auth.dependencies import Admin, KeyringDep, key_of
-from specimap_service.auth.keys import checked_name, derived_secret, key_text, new_key
+from specimap_service.auth.credentials import credential_of
+from specimap_service.auth.dependencies import Admin, KeyringDep
+from specimap_service.auth.keys import checked_name, derived_secret, is_secret_of, key_text, new_key
 from specimap_service.auth.object_ids import KeyId
 from specimap_service.context import Context, audit
-from specimap_service.errors import RequestInvalidError
+from specimap_service.errors import IdempotencyConflictError, RequestInvalidError
 from specimap_service.idempotency import IdempotencyKey, Repeatable, repeated
 from specimap_service.paging import After, InProject, Limit, MaybeLimit, Moment, Page, Sort, listed, page_of, paged
 
@@ -103,7 +104,7 @@ def create_key(
             advice="Give a later time, with its zone.",
             fields=[{"where": "body.expires_at", "what": "the time has passed"}],
         )
-    own = key_of(request)
+    own = credential_of(request)
 
     def make(session: Session, salt: str) -> tuple[str, NewKey]:
         project_id = principal.project_id if wanted.project is None else found_project(session, wanted.project).id
@@ -121,8 +122,14 @@ def create_key(
         return row.id, NewKey(**Key.model_validate(row).model_dump(), key=key)
 
     def again(session: Session, key_id: str, salt: str) -> NewKey:
-        row = load(session, principal, ApiKey, key_id)
-        return NewKey(**Key.model_validate(row).model_dump(), key=key_text(key_id, derived_secret(own, salt)))
+        row, secret = load(session, principal, ApiKey, key_id), derived_secret(own, salt)
+        if not is_secret_of(row, secret):
+            raise IdempotencyConflictError(
+                f"Another session of this key, or the key itself, made {key_id}: only there it is shown again.",
+                advice="Revoke it, and create another with a new idempotency key.",
+                key_id=key_id,
+            )
+        return NewKey(**Key.model_validate(row).model_dump(), key=key_text(key_id, secret))
 
     repeatable = Repeatable.of(principal, idempotency_key, "keys.create", wanted.model_dump(mode="json"))
     key, new = repeatable.once(context.database, make, again)

@@ -76,6 +76,7 @@ OWN: dict[str, tuple[Refusal, ...]] = {
     **{f"previews.get_{name}": _PICTURE for name in ("rgb", "pca", "band", "composite", "index", "label")},
     "projects.create": (core.SettingsError, infra.JobConflictError),
     "projects.update": (core.SettingsError, infra.JobConflictError),
+    "sessions.create": (service.UnauthorizedError, service.CrossSiteRequestError, service.RateLimitedError),
     "spectra.get_band": (*_ARRAYS, *_TURNS),
     "spectra.get_point": _CLOUD,
     "spectra.select": (*_ARRAYS, *_TURNS),
@@ -114,6 +115,8 @@ def common(method: str, path: str, operation: dict[str, Any]) -> Iterable[Refusa
     yield service.RequestInvalidError
     if operation.get("security"):
         yield from (service.UnauthorizedError, service.ForbiddenError, service.RateLimitedError)
+        # A browser may say of any request that another site's page made it.
+        yield service.CrossSiteRequestError
     if path != "/healthz":
         yield infra.DatabaseUnavailableError
     if "{" in path:

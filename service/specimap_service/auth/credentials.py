@@ -1,0 +1,69 @@
+"""What a request presents to be known: a key in a header, or the cookie of a session."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from typing import Literal
+
+from fastapi import Request
+
+from specimap_service.errors import CrossSiteRequestError, UnauthorizedError
+
+COOKIE = "specimap_session"
+PAGE_HEADER = "Specimap-Page"
+"""A header that the pages of this service send: those of other origins cannot without leave, which none gets."""
+SAFE = ("GET", "HEAD", "OPTIONS")
+"""Methods that change nothing."""
+
+
+@dataclass(frozen=True)
+class Credential:
+    """A key, or the token of a session."""
+
+    kind: Literal["key", "session"]
+    secret: str = field(repr=False)
+
+    @property
+    def fingerprint(self) -> str:
+        """A name for it that gives nothing away."""
+        return hashlib.sha256(f"{self.kind} {self.secret}".encode()).hexdigest()
+
+
+def credential_of(request: Request) -> Credential:
+    """Return what a request presents; where it has a key, its cookie does not count.
+
+    Raises:
+        UnauthorizedError: there is neither.
+        CrossSiteRequestError: there is a cookie, and another site may have made the request.
+    """
+    header = request.headers.get("authorization")
+    if header is None and (token := request.cookies.get(COOKIE)):
+        check_page(request)
+        return Credential("session", token)
+    kind, _, key = (header or "").partition(" ")
+    if kind.lower() != "bearer" or not key.strip():
+        raise UnauthorizedError("There is no key.", advice="Send it as `Authorization: Bearer <key>`, or sign in.")
+    return Credential("key", key.strip())
+
+
+def check_page(request: Request) -> None:
+    """Check that a page of this service, or a person, made a request whose cookie the browser adds by itself.
+
+    Raises:
+        CrossSiteRequestError: it changes something and lacks the pages' header, or the browser says that a page of
+            another origin made it.
+    """
+    safe = request.method in SAFE
+    # Not every browser says it, and none does on plain HTTP: the header is what counts then.
+    site = request.headers.get("sec-fetch-site", "same-origin")
+    if site not in (("same-origin", "none") if safe else ("same-origin",)):
+        raise CrossSiteRequestError(
+            "A page of another site made the request.",
+            advice="Use the service's own pages; programs send a key as `Authorization: Bearer <key>`.",
+        )
+    if not safe and request.headers.get(PAGE_HEADER) != "1":
+        raise CrossSiteRequestError(
+            f"The header {PAGE_HEADER} is missing.",
+            advice=f"Send `{PAGE_HEADER}: 1` with every request of a session that changes something.",
+        )

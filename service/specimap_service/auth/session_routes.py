@@ -1,0 +1,131 @@
+"""Signing in and out on the service's own pages."""
+
+from __future__ import annotations
+
+import datetime
+from typing import Annotated
+
+import sqlalchemy as sa
+from fastapi import APIRouter, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+
+from specimap_infra.database import rows_changed, utc_now
+from specimap_infra.settings import ServiceSettings
+from specimap_infra.tables import ApiKey, Project, SignIn
+from specimap_service.auth.credentials import COOKIE, Credential
+from specimap_service.auth.dependencies import KeyringDep, Known, known_by
+from specimap_service.auth.keys import Principal
+from specimap_service.auth.sessions import new_session, session_id
+from specimap_service.context import AppContext, Context, audit
+
+router = APIRouter(prefix="/v1", tags=["sessions"])
+
+
+class SessionRequest(BaseModel):
+    """What a person signs in with."""
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"example": {"key": f"spk_{'0' * 26}_{'0' * 64}"}})
+
+    key: Annotated[str, StringConstraints(pattern=r"^[\x21-\x7e]{1,200}$")] = Field(description="A key, `spk_…`.")
+
+
+class Session(BaseModel):
+    """Who asks: a key, directly or by a session."""
+
+    key_id: str
+    name: str = Field(description="The key's name.")
+    project_id: str
+    project: str = Field(description="The project's name.")
+    scopes: list[str]
+    expires_at: datetime.datetime | None = Field(description="When the session ends; for a key, when that expires.")
+    cloud_id: str | None = Field(description="The one cloud that the session sees, if it was made by a share's link.")
+
+
+@router.post("/session", status_code=201, operation_id="sessions.create")
+async def create_session(context: Context, request: Request, response: Response, wanted: SessionRequest) -> Session:
+    """Sign in with a key: the answer sets a cookie that stands for it until the session ends.
+
+    For pages of the service itself: it takes the header `Specimap-Page: 1`, as every later request with the cookie that
+    changes something does. A session that the request's cookie names already ends.
+    """
+    # Wrong keys count like those in headers.
+    principal = await known_by(request, Credential("key", wanted.key))
+    made, token = await run_in_threadpool(_begin, context, principal, request.cookies.get(COOKIE))
+    assert made.expires_at is not None
+    seconds = (made.expires_at - utc_now()).total_seconds()
+    _set_cookie(response, request, context.settings, token, max(1, int(seconds)))
+    return made
+
+
+@router.get("/session", operation_id="sessions.get")
+def get_session(context: Context, principal: Known, response: Response) -> Session:
+    """Tell who asks: the key, its project, what it may do, and until when."""
+    response.headers["Cache-Control"] = "no-store"
+    with context.database.session() as session:
+        key, project = session.get_one(ApiKey, principal.key_id), session.get_one(Project, principal.project_id)
+        row = None if principal.session_id is None else session.get(SignIn, principal.session_id)
+        return _view(key, project, key.expires_at if row is None else row.expires_at)
+
+
+@router.delete("/session", status_code=204, operation_id="sessions.delete")
+def delete_session(context: Context, principal: Known, keyring: KeyringDep, request: Request) -> Response:
+    """Sign out: the session ends, everywhere within two seconds, and the cookie goes. A key alone has none to end."""
+    _end(context, request.cookies.get(COOKIE))
+    keyring.forget()
+    response = Response(status_code=204)
+    _set_cookie(response, request, context.settings, "", 0)
+    return response
+
+
+def _begin(context: AppContext, principal: Principal, before: str | None) -> tuple[Session, str]:
+    _end(context, before)
+    with context.database.session() as session:
+        key, project = session.get_one(ApiKey, principal.key_id), session.get_one(Project, principal.project_id)
+        row, token = new_session(session, key, context.settings.session_hours)
+        audit(session, key.id, "session.create", key.id)
+        return _view(key, project, row.expires_at), token
+
+
+def _end(context: AppContext, token: str | None) -> None:
+    if token is None:
+        return
+    with context.database.session() as session:
+        row = session.get(SignIn, session_id(token))
+        # Two requests may end it at once.
+        if row is not None and rows_changed(session.execute(sa.delete(SignIn).where(SignIn.id == row.id))):
+            audit(session, row.key_id, "session.delete", row.key_id)
+
+
+def _view(key: ApiKey, project: Project, expires_at: datetime.datetime | None) -> Session:
+    return Session(
+        key_id=key.id,
+        name=key.name,
+        project_id=project.id,
+        project=project.name,
+        scopes=key.scopes,
+        expires_at=expires_at,
+        cloud_id=None,
+    )
+
+
+def _set_cookie(response: Response, request: Request, settings: ServiceSettings, token: str, seconds: int) -> None:
+    response.headers["Cache-Control"] = "no-store"
+    response.set_cookie(
+        COOKIE,
+        token,
+        max_age=seconds,
+        path="/",
+        secure=_over_tls(request, settings),
+        httponly=True,
+        samesite="strict",
+    )
+
+
+def _over_tls(request: Request, settings: ServiceSettings) -> bool:
+    """Return whether the browser speaks TLS, with the service or with a proxy before it.
+
+    Whoever makes up the proxy's header only gets a cookie that plain HTTP does not send.
+    """
+    forwarded = request.headers.get("x-forwarded-proto", "").partition(",")[0].strip().lower()
+    return "https" in (request.url.scheme, forwarded) or settings.public_url.lower().startswith("https://")
