@@ -24,6 +24,7 @@ pytest_plugins = (
     "tests.support.secret_file",
     "tests.support.json_line_scene",
     "tests.support.webhook_receiver",
+    "tests.support.browser_scene",
 )
 
 TEST_DATA_VARIABLE = "SPECIMAP_TEST_DATA"
