@@ -1,0 +1,49 @@
+/** Everything of one acquisition on one page: photos on one side; viewpoints, cube and job on the other. */
+import { useMemo } from "preact/hooks";
+import { number } from "../i18n";
+import { Loading, ProblemBox } from "../ui/boxes";
+import { useAcquisition } from "./acquisition-data";
+import { CubePanel } from "./cube/cube-panel";
+import { JobPanel } from "./job/job-panel";
+import { Notices } from "./notices";
+import { photosOf, tallied, WANTED } from "./photos/checks";
+import { PhotoPanel } from "./photos/photo-panel";
+import { t } from "./texts";
+import { items } from "./uploads/queue";
+
+export function CaptureView({ id }: { id: string }) {
+  const { acquisition, files, problem, refresh } = useAcquisition(id);
+  const all = items.value;
+  const mine = useMemo(() => all.filter((item) => item.acquisition === id), [all, id]);
+  const photos = useMemo(() => photosOf(files), [files]);
+  if (!acquisition) return problem ? <ProblemBox problem={problem} again={refresh} /> : <Loading />;
+  const { usable, again } = tallied(photos);
+  const complete = { cube: acquisition.files.cube, white: acquisition.files.white, dark: acquisition.files.dark };
+  const lost = problem !== null && (problem.status === 0 || problem.status >= 500);
+
+  return (
+    <div class="page capture" data-testid="capture">
+      <header class="row">
+        <h1 class="fill">{acquisition.specimen_id}</h1>
+        <span class="small">{t("edgeOf", { mm: number(acquisition.edge_mm, 2) })}</span>
+      </header>
+      <p class="small">{t("hold")}</p>
+      <Notices unreachable={lost} />
+      {problem && !lost && <ProblemBox problem={problem} again={refresh} />}
+      <div class="sides">
+        <PhotoPanel acquisition={id} photos={photos} pending={mine.filter(({ role }) => role === "photo")} refresh={refresh} />
+        <div class="aside">
+          <section>
+            <p data-testid="count" class={usable >= WANTED ? "good" : ""}>
+              <strong>{t("count", { n: usable, of: WANTED })}</strong>
+            </p>
+            <progress max={WANTED} value={Math.min(usable, WANTED)} aria-label={t("photos")} />
+            {again > 0 && <p class="fair">{t("retakeFirst", { n: again })}</p>}
+          </section>
+          <CubePanel acquisition={id} files={files} pending={mine.filter(({ role }) => role !== "photo")} complete={complete} refresh={refresh} />
+          <JobPanel acquisition={acquisition} onTheWay={mine.filter(({ state }) => state !== "failed").length} />
+        </div>
+      </div>
+    </div>
+  );
+}

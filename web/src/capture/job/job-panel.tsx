@@ -1,0 +1,163 @@
+/** The job: what it still needs, its start, its stages, and what to do when it fails. */
+import { useEffect, useState } from "preact/hooks";
+import { api, body } from "../../api/client";
+import { asProblem, type Problem } from "../../api/problem";
+import { href } from "../../app/route";
+import { may } from "../../app/session";
+import { ProblemBox } from "../../ui/boxes";
+import type { Acquisition } from "../acquisition-data";
+import { said } from "../judgement-texts";
+import { WANTED } from "../photos/checks";
+import { t } from "../texts";
+import { isFinal, useJobs } from "./follow";
+import { done, rounded, secondsLeft, stagesOf, type Job } from "./time-left";
+
+/** Photos without which the service runs no job. */
+const LEAST = 6;
+
+export function JobPanel({ acquisition, onTheWay }: { acquisition: Acquisition; onTheWay: number }) {
+  const jobs = useJobs(acquisition.id);
+  const [urgent, setUrgent] = useState(true);
+  const [problem, setProblem] = useState<Problem | null>(null);
+  const [busy, setBusy] = useState(false);
+  const [token, setToken] = useState(() => crypto.randomUUID());
+  const job = jobs.data?.[0];
+
+  const act = async (work: () => Promise<unknown>): Promise<void> => {
+    setBusy(true);
+    try {
+      await work();
+      setProblem(null);
+      setToken(crypto.randomUUID());
+      jobs.again();
+    } catch (thrown) {
+      const refused = asProblem(thrown);
+      if (refused.status !== 0 && refused.status < 500) setToken(crypto.randomUUID());
+      setProblem(refused);
+    } finally {
+      setBusy(false);
+    }
+  };
+  const start = (): Promise<void> =>
+    act(async () => {
+      const priority = may("intraoperative") && urgent ? "intraoperative" : "routine";
+      const params = { header: { "idempotency-key": token } };
+      await body(api.POST("/v1/jobs", { body: { acquisition_id: acquisition.id, priority }, params }));
+    });
+  const stop = (job_id: string): Promise<void> =>
+    act(async () => await api.POST("/v1/jobs/{job_id}/cancel", { params: { path: { job_id } } }));
+
+  const running = job !== undefined && !isFinal(job);
+  return (
+    <section aria-labelledby="job-title" class="job">
+      <h2 id="job-title">{t("job")}</h2>
+      {job && <JobState job={job} />}
+      {running && (
+        <button type="button" class="danger" disabled={busy} onClick={() => void stop(job.id)} data-testid="cancel-job">
+          {t("stop")}
+        </button>
+      )}
+      {!running && jobs.data && (
+        <Start acquisition={acquisition} onTheWay={onTheWay} busy={busy} before={job} start={() => void start()} urgent={urgent} setUrgent={setUrgent} />
+      )}
+      {problem && <ProblemBox problem={problem} />}
+    </section>
+  );
+}
+
+interface StartProps {
+  acquisition: Acquisition;
+  onTheWay: number;
+  busy: boolean;
+  before: Job | undefined;
+  start: () => void;
+  urgent: boolean;
+  setUrgent: (urgent: boolean) => void;
+}
+
+function Start({ acquisition: { ready, files }, onTheWay, busy, before, start, urgent, setUrgent }: StartProps) {
+  const what = [
+    ...(files.photos < LEAST ? [t("missingPhotos", { n: files.photos })] : []),
+    ...(files.cube ? [] : [t("missingCube")]),
+  ];
+  if (!ready && what.length === 0) what.push(t("missingReference"));
+  const few = files.photos < WANTED;
+  return (
+    <>
+      {!ready && (
+        <p class="small" data-testid="missing">
+          {t("missing", { what: what.join(", ") })}
+        </p>
+      )}
+      {may("intraoperative") && (
+        <label class="check">
+          <input type="checkbox" checked={urgent} onChange={(event) => setUrgent(event.currentTarget.checked)} /> {t("urgent")}
+        </label>
+      )}
+      <button type="button" class={`big${few || before?.state === "succeeded" ? "" : " primary"}`} disabled={!ready || busy || onTheWay > 0} onClick={start} data-testid="start-job">
+        {before ? t("rerun") : ready && few ? t("startFew", { n: files.photos }) : t("start")}
+      </button>
+      {onTheWay > 0 && (
+        <p class="small">
+          {t("onTheWay", { n: onTheWay })}. {t("waitUploads")}
+        </p>
+      )}
+    </>
+  );
+}
+
+function JobState({ job }: { job: Job }) {
+  const share = job.state === "succeeded" ? 1 : done(job.stage, job.progress);
+  return (
+    <div data-testid="job-state" data-state={job.state}>
+      <p role="status">
+        <strong class={job.state === "succeeded" ? "good" : job.state === "failed" ? "bad" : ""}>
+          {job.state === "queued" ? (job.queue_position ? t("queued", { n: job.queue_position }) : t("queuedNext")) : t(job.state)}
+        </strong>
+        {job.state === "running" && <TimeLeft job={job} share={share} />}
+      </p>
+      {!isFinal(job) && <progress max={1} value={share} aria-label={t("job")} />}
+      <ol class="stages">
+        {stagesOf(job).map(([stage, at]) => (
+          <li class={at} data-testid="job-stage" data-stage={stage} data-at={at} aria-current={at === "now" ? "step" : undefined}>
+            {t(stage)} <span class="hidden">: {t(at === "done" ? "stageDone" : at === "now" ? "stageNow" : "stageAhead")}</span>
+          </li>
+        ))}
+      </ol>
+      {job.error && <Failure job={job} />}
+      {job.cloud_id && (
+        <a class="button primary big" href={href(["view", job.cloud_id])} data-testid="view-cloud">
+          {t("view")}
+        </a>
+      )}
+    </div>
+  );
+}
+
+function Failure({ job: { error } }: { job: Job }) {
+  if (!error) return null;
+  const { reason, advice } = said(error.code, error.message, error.advice);
+  return (
+    <div class="box problem" role="alert" data-testid="job-failure">
+      <p>{reason}</p>
+      <p>{advice}</p>
+      <p class="small">
+        <code>{error.code}</code>
+      </p>
+    </div>
+  );
+}
+
+function TimeLeft({ job, share }: { job: Job; share: number }) {
+  const [now, setNow] = useState(Date.now);
+  useEffect(() => {
+    const timer = setInterval(() => setNow(Date.now()), 1000);
+    return () => clearInterval(timer);
+  }, []);
+  if (job.started_at === null) return null;
+  const left = secondsLeft(share, (now - Date.parse(job.started_at)) / 1000);
+  if (left === null) return null;
+  const about = rounded(left);
+  const time = about < 120 ? t("seconds", { n: about }) : t("minutes", { n: Math.round(about / 60) });
+  return <span class="small">: {t("left", { time })}</span>;
+}
