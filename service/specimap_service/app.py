@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
+from pathlib import Path
 
 from fastapi import Depends, FastAPI
 from fastapi_offline import FastAPIOffline
@@ -32,6 +33,7 @@ from specimap_service.jobs import dependencies as jobs
 from specimap_service.jobs import routes as job_routes
 from specimap_service.jobs.schemas import EVENT_TYPES
 from specimap_service.middleware import RequestObserver
+from specimap_service.page_files import FOLDER, Pages
 from specimap_service.query_parameters import check_query
 from specimap_service.uploads import dependencies as uploads
 from specimap_service.uploads import form_routes, tus_routes
@@ -68,8 +70,10 @@ ROUTES = (
 """Modules with a ``router``, in the order of the API's description."""
 
 
-def create_app(settings: ServiceSettings) -> FastAPI:
+def create_app(settings: ServiceSettings, pages: Path = FOLDER) -> FastAPI:
     """Create an app on the database and storage that the settings name; the database has been migrated.
+
+    ``pages``: the folder of the built web pages.
 
     Raises:
         SettingsError, OutputNotWritableError: the storage or its folder cannot be made.
@@ -104,6 +108,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     describe(app, extra_models=[SpectraRequest, *EVENT_TYPES.values()])
     for routes in ROUTES:
         app.include_router(routes.router)
+    app.router.routes.append(Pages(pages, settings.public_url))
     # The last one added sees a request first: the limits come after CORS and the corrections of uploads, and before
     # everything that reads a body.
     app.add_middleware(Compression)

@@ -31,6 +31,8 @@ CACHED = "private, max-age=300"
 """For content that never changes under its address; short, so that deleted content soon disappears from caches."""
 REVALIDATED = "private, no-cache"
 """For content that may change: the client keeps it, but checks its ETag every time."""
+VARY = "Authorization, Cookie"
+"""Whoever signs out, or in with another key, gets nothing from the browser's cache."""
 _RANGE = re.compile(r"^bytes=\s*(\d{0,18})\s*-\s*(\d{0,18})\s*$")
 _TAG = re.compile(r'(?:W/)?"[^"]*"')
 
@@ -77,7 +79,7 @@ def names_tag(request: Request, etag: str) -> bool:
 
 def _answer(request: Request, source: _Source, media_type: str, filename: str | None, cache: str) -> Response:
     etag = f'"{source.etag}"'
-    headers = {"ETag": etag, "Cache-Control": cache, "Accept-Ranges": "bytes", "Vary": "Authorization"}
+    headers = {"ETag": etag, "Cache-Control": cache, "Accept-Ranges": "bytes", "Vary": VARY}
     asked = request.headers
     if (wanted := asked.get("if-match")) is not None and not _matches(wanted, etag, weakly=False):
         return problem_response(

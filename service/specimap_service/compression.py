@@ -15,6 +15,11 @@ LEVEL = 4
 _GZIP = re.compile(r"(?:^|,)\s*(?:gzip|\*)\s*(?:$|,|;(?!\s*q=0(?:\.0*)?\s*(?:$|,)))", re.IGNORECASE)
 
 
+def takes_gzip(headers: Headers) -> bool:
+    """Return whether the client that sent the headers accepts gzip."""
+    return _GZIP.search(headers.get("accept-encoding", "")) is not None
+
+
 class _OnlyJson(IdentityResponder):
     """A responder that lets everything pass but JSON without a tag.
 
@@ -54,7 +59,7 @@ class Compression:
         """Pass the request on."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
-        elif _GZIP.search(Headers(scope=scope).get("accept-encoding", "")):
+        elif takes_gzip(Headers(scope=scope)):
             await _Gzip(self._app, SMALLEST, LEVEL)(scope, receive, send)
         else:
             await _Plain(self._app, SMALLEST)(scope, receive, send)

@@ -1,4 +1,5 @@
-"""Plain ASGI middleware: correlation id, access log, metrics, and the answer to unforeseen errors."""
+"""Plain ASGI middleware: correlation id, access log, metrics, headers for browsers, and the answer to unforeseen
+errors."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ import secrets
 import time
 
 import structlog
+from starlette.datastructures import MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from specimap_core.errors import SpecimapError
@@ -14,6 +16,7 @@ from specimap_infra.logs import logger
 from specimap_service.context import ANSWER_HEADERS
 from specimap_service.metrics import Metrics
 from specimap_service.problems import problem_response
+from specimap_service.security_headers import add_policy
 
 HEADER = b"x-correlation-id"
 ACCEPTED = re.compile(rb"^[A-Za-z0-9._-]{8,64}$")
@@ -47,8 +50,10 @@ class RequestObserver:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = message["status"]
+                given_headers = MutableHeaders(raw=list(message.get("headers", [])))
+                add_policy(given_headers, scope["path"])
                 message["headers"] = [
-                    *message.get("headers", []),
+                    *given_headers.raw,
                     (HEADER, correlation.encode()),
                     (b"x-content-type-options", b"nosniff"),
                     *((name.lower().encode(), value.encode()) for name, value in more.items()),

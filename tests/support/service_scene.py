@@ -29,6 +29,7 @@ from specimap_service.acquisitions import dependencies
 from specimap_service.acquisitions.judge import Judge
 from specimap_service.app import create_app
 from specimap_service.auth.keys import new_key
+from specimap_service.page_files import FOLDER
 from specimap_service.server import server_config
 from tests.support.databases import create_tables
 from tests.support.documented import check_refusal
@@ -118,8 +119,8 @@ def pytest_sessionfinish() -> None:
 
 
 @contextmanager
-def serving(folder: Path, *, own_judge: bool = False, **given: object) -> Iterator[Running]:
-    """Serve from a folder until the block ends; ``given`` are settings.
+def serving(folder: Path, *, own_judge: bool = False, pages: Path = FOLDER, **given: object) -> Iterator[Running]:
+    """Serve from a folder until the block ends; ``given`` are settings, ``pages`` the folder of the web pages.
 
     ``own_judge``: with judging processes of its own, for tests of these and of settings that concern them.
     """
@@ -134,7 +135,7 @@ def serving(folder: Path, *, own_judge: bool = False, **given: object) -> Iterat
     create_tables(database)
     database.close()
     with mock.patch.object(dependencies, "Judge", Judge if own_judge else lambda *_: shared_judge()):
-        app = create_app(settings)
+        app = create_app(settings, pages)
     server = uvicorn.Server(server_config(app, settings, host="127.0.0.1", port=0))
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()

@@ -34,8 +34,9 @@ def test_person_signs_in_with_a_key_that_stays_nowhere(service: Running, window:
 def test_session_that_ends_meanwhile_is_said(service: Running, window: Window) -> None:
     page = window.page
     window.sign_in(service.url, service.key())
+    expect(page.get_by_text("There is no acquisition yet.")).to_be_visible()
     page.context.clear_cookies()
-    page.get_by_role("link", name="Jobs").click()
+    # The list asks again by itself, as every page does.
     expect(page.get_by_text("The session has ended")).to_be_visible()
 
 

@@ -16,7 +16,7 @@ from specimap_core.json_text import json_text
 from specimap_infra.tables import LabelVersion
 from specimap_service.auth.dependencies import Reader
 from specimap_service.auth.object_ids import CloudId
-from specimap_service.byte_ranges import known_to_client, names_tag
+from specimap_service.byte_ranges import VARY, known_to_client, names_tag
 from specimap_service.clouds import drawing
 from specimap_service.clouds.dependencies import CloudsDep, PicturesDep
 from specimap_service.clouds.drawing import Drawing, Paint
@@ -83,7 +83,7 @@ class Previews:
         # A cloud never changes: parameters and program version identify the picture.
         identity = json_text([__version__, cloud_id, grid, size, *parameters])
         tag = hashlib.sha256(identity.encode()).hexdigest()[:32]
-        headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache", "Vary": "Authorization"}
+        headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache", "Vary": VARY}
         if names_tag(self.request, f'"{tag}"'):
             # The picture was drawn for this client once.
             return Response(status_code=304, headers=headers)

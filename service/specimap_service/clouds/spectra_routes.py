@@ -28,7 +28,7 @@ from specimap_service.array_responses import (
 from specimap_service.auth.dependencies import Reader
 from specimap_service.auth.object_ids import CloudId
 from specimap_service.body_limits import parsed
-from specimap_service.byte_ranges import CACHED, known_to_client
+from specimap_service.byte_ranges import CACHED, VARY, known_to_client
 from specimap_service.clouds.dependencies import CloudsDep, ReadingDep
 from specimap_service.clouds.open_clouds import CloudRecord, OpenClouds
 from specimap_service.clouds.spectra import (
@@ -199,7 +199,7 @@ def _band(clouds: OpenClouds, cloud_id: str, band: int, request: Request, pace: 
             )
         # Spectra never change.
         etag = f'"{cloud_id}-{band}-{media.rpartition("/")[2]}"'
-        headers = {"ETag": etag, "Cache-Control": CACHED, "Vary": "Accept, Authorization"}
+        headers = {"ETag": etag, "Cache-Control": CACHED, "Vary": f"Accept, {VARY}"}
         if known_to_client(request, etag):
             return Response(status_code=304, headers=headers)
         values = cloud.band(band)
