@@ -36,7 +36,7 @@ def test_session_that_ends_meanwhile_is_said(service: Running, window: Window) -
     window.sign_in(service.url, service.key())
     expect(page.get_by_text("There is no acquisition yet.")).to_be_visible()
     page.context.clear_cookies()
-    # The list asks again by itself, as every page does.
+    page.get_by_role("link", name="Jobs").click()
     expect(page.get_by_text("The session has ended")).to_be_visible()
 
 
