@@ -14,7 +14,7 @@ from specimap_core import __version__
 from specimap_infra.settings import ServiceSettings
 from specimap_service import health, problems
 from specimap_service.acquisitions import dependencies as acquisitions
-from specimap_service.acquisitions import file_routes
+from specimap_service.acquisitions import file_routes, viewpoint_routes
 from specimap_service.acquisitions import routes as acquisition_routes
 from specimap_service.auth import dependencies as auth
 from specimap_service.auth import project_routes, session_routes
@@ -57,6 +57,7 @@ ROUTES = (
     acquisition_routes,
     form_routes,
     file_routes,
+    viewpoint_routes,
     upload_routes,
     job_routes,
     delivery_routes,

@@ -7,6 +7,7 @@ import re
 import shutil
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -117,6 +118,9 @@ def uploads(reader: Reader) -> None:
     assert (reader.folder / "original.jpg").read_bytes() == photo.read_bytes()
     now = reader.client.get(f"/v1/acquisitions/{made['id']}").json()
     assert (now["files"]["photos"], now["ready"], now["missing"]) == (6, True, [])
+    (dome,) = documents(reader.sh("Viewpoints"))
+    assert [len(dome["photos"]), len(dome["unplaced"]), dome["enough"]] == [6, 0, False]
+    assert Counter(cell["elevation_deg"] for cell in dome["cells"]) == {35: 10, 55: 8, 75: 4}
     assert "v1/uploads" in reader.next("A page on a tablet", "js")
 
 

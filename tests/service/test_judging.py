@@ -108,7 +108,16 @@ def test_light_size_and_markers(tmp_path: Path) -> None:
     one[20:130, 20:130] = 230
     one[35:115, 35:115] = marker[..., None]
     assert verdict_of(at, jpeg(one)) == "few_markers"
-    assert judge_photo(at, "DICT_4X4_50", Others()).facts["marker_ids"] == [3]
+    facts = judge_photo(at, "DICT_4X4_50", Others()).facts
+    assert facts["marker_ids"] == [3]
+    (marker,) = facts["markers"]
+    assert marker["id"] == 3
+    square = np.array([[34.5, 34.5], [114.5, 34.5], [114.5, 114.5], [34.5, 114.5]])
+    assert np.abs(np.array(marker["corners"]) - square).max() < 0.3
+    large = jpeg(np.asarray(cv2.resize(one, None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST), np.uint8))
+    at.write_bytes(large)
+    corners = np.array(judge_photo(at, "DICT_4X4_50", Others()).facts["markers"][0]["corners"])
+    assert np.abs(corners - ((square + 0.5) * 4 - 0.5)).max() < 1
 
 
 def one_bit_bomb(side: int = 30_000) -> bytes:

@@ -178,6 +178,7 @@ CASES: dict[tuple[str, str], Case] = {
     ("POST", "/v1/acquisitions"): Case("upload", 201, _json(specimen_id="S-2")),
     ("GET", ACQUISITION): _read(),
     ("GET", f"{ACQUISITION}/files"): _read(),
+    ("GET", f"{ACQUISITION}/viewpoints"): _read(),
     ("POST", f"{ACQUISITION}/files"): Case(
         "upload", 201, lambda _: {"data": {"role": "photo"}, "files": {"file": ("x", b"x")}}, aims=True
     ),

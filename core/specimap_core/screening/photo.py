@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specimap_core.errors import NoMarkersFoundError, PhotoUnreadableError, WrongDictionaryError
-from specimap_core.fiducials.detection import detect_markers, fitting_dictionaries, shared_sightings
+from specimap_core.fiducials.detection import Detection, detect_markers, fitting_dictionaries, shared_sightings
 from specimap_core.photos.decoding import LARGEST_PHOTO_PIXELS, check_pixels, photo_suffix
 from specimap_core.photos.reading import AcquisitionSettings, read_photo, same_shape
 from specimap_core.screening.verdict import Verdict
@@ -22,6 +22,8 @@ from specimap_core.screening.verdict import Verdict
 LEAST_SIDE_PX = 240
 """Of the longer side: below it no marker in a usual view has the 7 pixels an edge needs."""
 LEAST_MARKERS = 2
+MOST_MARKERS = 64
+"""Whose corners are told: the largest ones, of a printed board."""
 # Measured at working size on 90 photos of phones, cameras and phantoms, sharp, defocused and shaken. Sharp ones have
 # 0.0024 and more, and a third of their scene's median; defocused by two pixels, or shaken by 15, hardly one has 0.0012.
 LEAST_SHARPNESS = 0.001
@@ -52,7 +54,8 @@ class Others:
 
 
 def judge_photo(path: Path, dictionary: str, others: Others, most_pixels: int = LARGEST_PHOTO_PIXELS) -> Verdict:
-    """Judge a photo. Facts: ``suffix`` by its format, ``width``, ``height``, ``sharpness``, ``marker_ids``,
+    """Judge a photo. Facts: ``suffix`` by its format, ``width``, ``height``, ``sharpness``, ``clipped`` (the share
+    that is overexposed), ``marker_ids``, ``markers`` with their corners in pixels of the upright photo,
     ``dictionary_seen`` where its markers are of another one.
 
     One of more than ``most_pixels`` that would have to be decoded whole is refused by its header.
@@ -62,7 +65,9 @@ def judge_photo(path: Path, dictionary: str, others: Others, most_pixels: int = 
         "width": None,
         "height": None,
         "sharpness": None,
+        "clipped": None,
         "marker_ids": [],
+        "markers": [],
         "dictionary_seen": None,
     }
     try:
@@ -78,11 +83,14 @@ def judge_photo(path: Path, dictionary: str, others: Others, most_pixels: int = 
         return Verdict("refused", "photo_too_small", reason, "Give the photo as the phone made it.", facts)
     grey = photo.grey
     sharpness, isotropy = directional_sharpness(grey)
-    ids = sorted({found.marker_id for found in detect_markers(grey, dictionary, expected=LEAST_MARKERS)})
-    facts |= {"sharpness": round(sharpness, 6), "marker_ids": ids}
+    found = detect_markers(grey, dictionary, expected=LEAST_MARKERS)
+    ids = sorted({one.marker_id for one in found})
+    clipped = float((photo.image.min(2) >= 254).mean())
+    facts |= {"sharpness": round(sharpness, 6), "clipped": round(clipped, 4), "marker_ids": ids}
+    facts["markers"] = _corners(found, max(width, height) / max(grey.shape))
     for doubt in (
         _blurred(sharpness, isotropy, others.sharpness),
-        _exposure(photo.image, grey),
+        _exposure(clipped, grey),
         _markers(ids, grey, dictionary),
         _foreign((width, height), others.sizes),
     ):
@@ -115,8 +123,15 @@ def _blurred(sharpness: float, isotropy: float, others: Sequence[float]) -> Verd
     return Verdict("doubtful", "photo_blurred", reason, "Take it again: hold still and tap on the specimen to focus.")
 
 
-def _exposure(image: NDArray[np.uint8], grey: NDArray[np.uint8]) -> Verdict | None:
-    clipped = float((image.min(2) >= 254).mean())
+def _corners(found: Sequence[Detection], enlarged: float) -> list[dict[str, Any]]:
+    """The largest markers with their corners in the file's pixels, which are ``enlarged`` times as many."""
+    shown = sorted(sorted(found, key=lambda one: -one.edge_px)[:MOST_MARKERS], key=lambda one: one.marker_id)
+    return [
+        {"id": one.marker_id, "corners": np.round((one.corners_px + 0.5) * enlarged - 0.5, 2).tolist()} for one in shown
+    ]
+
+
+def _exposure(clipped: float, grey: NDArray[np.uint8]) -> Verdict | None:
     if clipped > MOST_CLIPPED:
         reason = f"{clipped:.0%} of it is overexposed."
         return Verdict("doubtful", "photo_overexposed", reason, "Take it again with less light or shorter exposure.")

@@ -29,12 +29,16 @@ INTAKE = AppState[FairTurns]("intake")
 INTAKES = TurnBounds(at_once=8, of_key=4, waiting=256, waiting_of_key=64, retry_after_s=5)
 """Files that have arrived and are hashed, judged and stored: at a time, and waiting for it. A waiting one takes a
 connection and its place on the disk, and no thread."""
+PLACING = AppState[FairTurns]("placing")
+PLACED = TurnBounds(at_once=2, of_key=1, waiting=64, waiting_of_key=8)
+"""Acquisitions whose photos are placed in the dome: some hundredths of a second each, up to one with 300 photos."""
 UNFINISHED_UPLOADS = AppState[UnfinishedUploads]("unfinished_uploads")
 
 
 def _open(app: FastAPI, context: AppContext) -> None:
     JUDGE.set(app, Judge(context.settings, os.environ))
     INTAKE.set(app, FairTurns(INTAKES))
+    PLACING.set(app, FairTurns(PLACED))
 
 
 @asynccontextmanager
@@ -42,6 +46,7 @@ async def _running(app: FastAPI) -> AsyncIterator[None]:
     try:
         yield
     finally:
+        PLACING.of(app).close()
         INTAKE.of(app).close()
         JUDGE.of(app).close()
 
@@ -49,4 +54,5 @@ async def _running(app: FastAPI) -> AsyncIterator[None]:
 FEATURE = Feature(_open, _running)
 JudgeDep = Annotated[Judge, Depends(JUDGE.of_request)]
 IntakeDep = Annotated[FairTurns, Depends(INTAKE.of_request)]
+PlacingDep = Annotated[FairTurns, Depends(PLACING.of_request)]
 UnfinishedUploadsDep = Annotated[UnfinishedUploads, Depends(UNFINISHED_UPLOADS.of_request)]

@@ -176,7 +176,9 @@ def _refusal(kind: str, *, slow: bool) -> Verdict:
             "width": None,
             "height": None,
             "sharpness": None,
+            "clipped": None,
             "marker_ids": [],
+            "markers": [],
             "dictionary_seen": None,
         }
     reason = f"The {'photo' if kind == 'photo' else 'cube'} {what}: it is damaged, or made to do so."

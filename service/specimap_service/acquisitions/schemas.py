@@ -32,6 +32,18 @@ class Judged(BaseModel):
     advice: str = Field(description="What to do.")
 
 
+Coordinate = Annotated[float, Field(ge=-(2**17), le=2**17)]
+
+
+class MarkerSeen(BaseModel):
+    """A marker that was read in a photo."""
+
+    id: int
+    corners: Annotated[list[tuple[Coordinate, Coordinate]], Field(min_length=4, max_length=4)] = Field(
+        description="x, y of its top-left, top-right, bottom-right, bottom-left corner, in pixels of the upright photo."
+    )
+
+
 class PhotoJudgement(Judged):
     """The judgement of a photo."""
 
@@ -42,6 +54,10 @@ class PhotoJudgement(Judged):
     marker_ids: list[int] = Field(description="Markers of the acquisition's dictionary that were read.")
     dictionary_seen: str | None = Field(description="Where the markers are of another dictionary: which.")
     same_as: str | None = Field(None, description="Where the same photo is there already: its label.")
+    clipped: float | None = Field(None, description="Share of the photo that is overexposed; null where unknown.")
+    markers: list[MarkerSeen] = Field(
+        [], max_length=64, description="The markers with their corners; empty in judgements of earlier versions."
+    )
 
 
 class CubeJudgement(Judged):

@@ -10,7 +10,7 @@ from specimap_service.acquisitions.schemas import CubeJudgement, PhotoJudgement
 
 LONGEST_TEXT = 1000
 MOST_ITEMS = 2000
-DEEPEST = 4
+DEEPEST = 5
 LARGEST_NUMBER = 2**53
 WAVELENGTHS_NM = (1.0, 1e7)
 """Beyond lie X-rays and microwaves, which no cube records."""

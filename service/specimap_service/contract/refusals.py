@@ -41,6 +41,7 @@ _TUS: tuple[Refusal, ...] = (
 
 OWN: dict[str, tuple[Refusal, ...]] = {
     "acquisitions.delete": (infra.JobConflictError, infra.StorageUnavailableError),
+    "acquisitions.list_viewpoints": _TURNS,
     "clouds.get": _CLOUD,
     "clouds.get_corners": _RANGES,
     "deliveries.create": (core.SettingsError, infra.JobConflictError),
