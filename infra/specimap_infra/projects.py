@@ -26,6 +26,7 @@ from specimap_infra.tables import (
     Export,
     Job,
     Project,
+    Share,
     StoredFile,
     Upload,
 )
@@ -45,10 +46,13 @@ _OWNERS: dict[str, sa.Select[str]] = {
         .join(Acquisition, Acquisition.id == table.acquisition_id)
         for kind, table in (("file", StoredFile), ("up", Upload), ("job", Job), ("cloud", CloudRow))
     },
-    "exp": sa.select(Acquisition.project_id)
-    .select_from(Export)
-    .join(CloudRow, CloudRow.id == Export.cloud_id)
-    .join(Acquisition, Acquisition.id == CloudRow.acquisition_id),
+    **{
+        kind: sa.select(Acquisition.project_id)
+        .select_from(table)
+        .join(CloudRow, CloudRow.id == table.cloud_id)
+        .join(Acquisition, Acquisition.id == CloudRow.acquisition_id)
+        for kind, table in (("exp", Export), ("shr", Share))
+    },
 }
 _IDS = {
     "prj": Project.id,
@@ -59,6 +63,7 @@ _IDS = {
     "job": Job.id,
     "cloud": CloudRow.id,
     "exp": Export.id,
+    "shr": Share.id,
 }
 
 

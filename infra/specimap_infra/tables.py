@@ -293,6 +293,23 @@ class CloudRow(Base):
     created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now, index=True)
 
 
+class Share(Base):
+    """A link that shows one cloud to people without a key; only the hash of its secret is kept."""
+
+    __tablename__ = "shares"
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    cloud_id: Mapped[str] = _owned_by("clouds")
+    name: Mapped[str]
+    secret_hash: Mapped[str]
+    created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now)
+    created_by: Mapped[str]
+    """The key that made it, with which it ends."""
+    expires_at: Mapped[datetime.datetime]
+    revoked_at: Mapped[datetime.datetime | None]
+    last_used_at: Mapped[datetime.datetime | None]
+
+
 class LabelVersion(Base):
     """One version of a label layer of a cloud; the highest is the current one."""
 

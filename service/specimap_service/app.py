@@ -21,7 +21,14 @@ from specimap_service.auth import project_routes, session_routes
 from specimap_service.auth import routes as key_routes
 from specimap_service.body_limits import BodyLimits
 from specimap_service.clouds import dependencies as clouds
-from specimap_service.clouds import export_routes, label_routes, preview_routes, spectra_routes, zarr_routes
+from specimap_service.clouds import (
+    export_routes,
+    label_routes,
+    preview_routes,
+    share_routes,
+    spectra_routes,
+    zarr_routes,
+)
 from specimap_service.clouds import routes as cloud_routes
 from specimap_service.clouds.spectra_schemas import SpectraRequest
 from specimap_service.compression import Compression
@@ -67,6 +74,7 @@ ROUTES = (
     preview_routes,
     label_routes,
     export_routes,
+    share_routes,
 )
 """Modules with a ``router``, in the order of the API's description."""
 

@@ -12,7 +12,7 @@ class UnauthorizedError(SpecimapError, PermissionError):
 
 
 class ForbiddenError(SpecimapError, PermissionError):
-    """The key is valid but lacks the scope; ``details['scope']`` names it."""
+    """The key is valid but lacks the scope, which ``details['scope']`` names; or a share shows another result."""
 
     code = "forbidden"
 

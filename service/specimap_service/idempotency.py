@@ -33,7 +33,7 @@ IdempotencyKey = Annotated[
     ),
 ]
 T = TypeVar("T")
-_KINDS = {"acq": "acquisition", "exp": "export", "prj": "project", "up": "upload"}
+_KINDS = {"acq": "acquisition", "exp": "export", "prj": "project", "shr": "share", "up": "upload"}
 
 
 def repeated(model: type[BaseModel]) -> dict[int | str, dict[str, Any]]:

@@ -86,7 +86,10 @@ def test_key_does_what_its_scope_says_in_its_project(any_service: Running, tmp_p
             assert answer.status_code == 403, f"{method} {path} with {scope}: {answer.text[:300]}"
             if method != "HEAD":
                 assert (answer.json()["code"], answer.json()["details"]) == ("forbidden", {"scope": case.scope})
-        answer = case.send(holders[case.scope or "read"], method, path, world)
+        holder = holders[case.scope or "read"]
+        if case.also:
+            holder = any_service.client([case.scope or "read", *case.also], project=project)
+        answer = case.send(holder, method, path, world)
         assert answer.status_code == case.status, f"{method} {path}: {answer.status_code} {answer.text[:300]}"
 
 

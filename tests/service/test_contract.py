@@ -75,8 +75,8 @@ def test_every_operation_but_health_wants_a_key(contract: dict[str, Any], servic
             if path in ("/healthz", "/readyz") or operation["operationId"] == "sessions.create":
                 continue
             assert operation["security"], f"{method} {path}"
-            for name in ("key", "acquisition", "file", "job", "cloud", "project"):
-                kind = {"acquisition": "acq", "project": "prj"}.get(name, name)
+            for name in ("key", "acquisition", "file", "job", "cloud", "project", "share"):
+                kind = {"acquisition": "acq", "project": "prj", "share": "shr"}.get(name, name)
                 path = path.replace(f"{{{name}_id}}", f"{kind}_{'0' * 26}")
             for name, value in {"upload_id": f"up_{'0' * 26}", "uuid": f"up_{'0' * 26}"}.items():
                 path = path.replace(f"{{{name}}}", value)

@@ -14,7 +14,7 @@ import sqlalchemy as sa
 
 from specimap_infra import jobs
 from specimap_infra.database import utc_now
-from specimap_infra.tables import Acquisition, ApiKey, Delivery, Export, Job, Project, RepeatableRequest, Upload
+from specimap_infra.tables import Acquisition, ApiKey, Delivery, Export, Job, Project, RepeatableRequest, Share, Upload
 from specimap_service.contract.description import operations
 from specimap_service.idempotency import KEPT
 from tests.support.documented import contract
@@ -61,7 +61,7 @@ def requests_of(service: Running, folder: Path) -> dict[str, tuple[Send, Send, A
     with service.database.session() as session:
         for job in (sent, other):
             jobs.request_cancel(session, job)
-    key = {"name": "tablet", "scopes": ["read"]}
+    key, soon = {"name": "tablet", "scopes": ["read"]}, (utc_now() + datetime.timedelta(days=1)).isoformat()
     rerun = reruns({"priority": "research"})
     return {
         "acquisitions.create": (
@@ -75,6 +75,11 @@ def requests_of(service: Running, folder: Path) -> dict[str, tuple[Send, Send, A
             posts(f"/v1/clouds/{cloud}/exports/ply", {}),
             posts(f"/v1/clouds/{cloud}/exports/npz", {}),
             Export,
+        ),
+        "shares.create": (
+            posts(f"/v1/clouds/{cloud}/shares", {"name": "a", "expires_at": soon}),
+            posts(f"/v1/clouds/{cloud}/shares", {"name": "b", "expires_at": soon}),
+            Share,
         ),
         "uploads.create": (uploads(300), uploads(301), Upload),
         "jobs.create": (

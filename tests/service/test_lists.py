@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import re
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 import sqlalchemy as sa
 
 from specimap_infra import jobs
+from specimap_infra.database import utc_now
 from specimap_infra.ids import new_id
 from specimap_infra.tables import Delivery, StoredFile
 from specimap_service.contract.description import operations
@@ -40,6 +42,9 @@ def full_lists(service: Running, client: httpx.Client, folder: Path) -> dict[str
         values = (np.arange(points) < number).astype(np.uint8)
         answer = client.put(f"{cloud}/labels/{name}", content=npy(values), headers=header())
         assert answer.status_code == 201, answer.text
+    soon = (utc_now() + datetime.timedelta(days=1)).isoformat()
+    for name in ("a", "b", "c"):
+        assert client.post(f"{cloud}/shares", json={"name": name, "expires_at": soon}).status_code == 201
     for format in ("npz", "ply"):
         client.post(f"{cloud}/exports/{format}")
     owner = acquisition(service.database)
@@ -67,6 +72,7 @@ def full_lists(service: Running, client: httpx.Client, folder: Path) -> dict[str
         "labels.list": f"{cloud}/labels",
         "labels.list_versions": f"{cloud}/labels/a/versions",
         "exports.list": f"{cloud}/exports",
+        "shares.list": f"{cloud}/shares",
     }
 
 

@@ -44,6 +44,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Running, R
                 "uuid": upload,
                 "key_id": f"key_{'0' * 26}",
                 "project_id": DEFAULT_PROJECT,
+                "share_id": f"shr_{'0' * 26}",
             },
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,9 +12,11 @@ import httpx
 import numpy as np
 import sqlalchemy as sa
 
+from specimap_infra.database import utc_now
 from specimap_infra.ids import new_id
 from specimap_infra.tables import SCOPES, StoredFile
 from specimap_service.auth.keys import new_key
+from specimap_service.auth.shares import new_share
 from tests.support.job_scene import acquisition, queued_job
 from tests.support.label_files import header, layer, npy
 from tests.support.result_scene import put_result
@@ -41,6 +44,7 @@ KINDS = {
     "upload_id": "up",
     "job_id": "job",
     "cloud_id": "cloud",
+    "share_id": "shr",
 }
 """Kinds of ids by their names in addresses."""
 OTHERS = {"key": "zarr.json", "format": "mesh-ply", "index": "0", "band": "0"}
@@ -86,6 +90,11 @@ def make_world(service: Running, folder: Path, project: str, uploader: httpx.Cli
         row, _ = new_key("of the world", ["read"], project_id=project)
         session.add(row)
         key = row.id
+        share, _ = new_share(
+            result.cloud_id, "board", utc_now() + datetime.timedelta(days=1), created_by=key, secret=None
+        )
+        session.add(share)
+        share_id = share.id
     upload = created(uploader, owner, "photo", 3).rpartition("/")[2]
     return World(
         {
@@ -96,6 +105,7 @@ def make_world(service: Running, folder: Path, project: str, uploader: httpx.Cli
             "upload_id": upload,
             "job_id": result.job_id,
             "cloud_id": result.cloud_id,
+            "share_id": share_id,
         },
         {"acquisition_id": spare, "file_id": files[spare], "job_id": queued_job(database, spare)},
         "tissue",
@@ -113,7 +123,8 @@ class Case:
     """A request that succeeds for a key with the scope in the objects' project.
 
     ``scope``: None where every key will do. ``given``: arguments of the request. ``aims``: whether it names an object.
-    ``spare``: on the spare objects. ``ends``: it deletes something, so it comes last.
+    ``spare``: on the spare objects. ``ends``: it deletes something, so it comes last. ``also``: scopes that the key
+    needs besides.
     """
 
     scope: str | None
@@ -121,6 +132,7 @@ class Case:
     given: Given = field(default=lambda _: {})
     aims: bool = False
     spare: bool = False
+    also: tuple[str, ...] = ()
 
     def path(self, path: str, world: World) -> str:
         """The address of the world's object."""
@@ -147,6 +159,10 @@ def _upload(world: World) -> dict[str, Any]:
 
 def _names(_: World) -> dict[str, Any]:
     return {"json": {"name": new_id("att")}}
+
+
+def _share(_: World) -> dict[str, Any]:
+    return {"json": {"name": "board", "expires_at": (utc_now() + datetime.timedelta(days=30)).isoformat()}}
 
 
 CLOUD = "/v1/clouds/{cloud_id}"
@@ -234,8 +250,11 @@ CASES: dict[tuple[str, str], Case] = {
     ("GET", f"{CLOUD}/exports"): _read(),
     ("GET", f"{EXPORT}/content"): _read(),
     ("HEAD", f"{EXPORT}/content"): _read(),
+    ("GET", f"{CLOUD}/shares"): Case("upload", aims=True),
+    ("POST", f"{CLOUD}/shares"): Case("upload", 201, _share, aims=True, also=("read",)),
     # what ends something: each after all that needs it
     ("DELETE", "/v1/uploads/{uuid}"): Case("upload", 204, _tus(), aims=True),
+    ("DELETE", f"{CLOUD}/shares/{{share_id}}"): Case("upload", 204, aims=True),
     ("DELETE", LABEL): Case("label", 204, aims=True),
     ("POST", f"{JOB}/cancel"): Case("upload", 202, aims=True, spare=True),
     ("DELETE", f"{ACQUISITION}{FILE}"): Case("upload", 204, aims=True, spare=True),

@@ -26,6 +26,7 @@ REASONS: dict[str, tuple[str, ...]] = {
     "jobs.create": (r"The webhook's host is not one",),
     "jobs.rerun": (r"The webhook's host is not one",),
     "keys.create": (r"the time has passed", r"none of them a control character"),
+    "shares.create": (r"the time has passed", r"days from now", r"none of them a control character"),
     "uploads.create": (r"Upload-Metadata names no (role|acquisition)",),
     "labels.put": (r"The body is not an Arrow IPC stream", r"The body is no npy"),
 }

@@ -1,4 +1,4 @@
-"""Which objects a key may touch: those of its project; an administrator's key all.
+"""Which objects a key may touch: those of its project; an administrator's key all; a share its cloud.
 
 An object of another project is answered exactly like one that does not exist: both are looked for by the same query,
 and refused by the same error.
@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 from specimap_core.errors import NotFoundError
 from specimap_infra.database import Database
 from specimap_infra.projects import named, no_project, project_of, within
-from specimap_infra.tables import Base, Project
+from specimap_infra.tables import Base, CloudRow, Project
 from specimap_service.auth.keys import Principal
 
 _MOST_KNOWN = 20_000
@@ -25,6 +25,7 @@ _ADVICE = {
     "job": ("job", "Check the id; it may have been deleted."),
     "cloud": ("cloud", "GET /v1/clouds lists all."),
     "key": ("key", "GET /v1/keys lists all."),
+    "shr": ("share", "GET the shares of the cloud lists all."),
 }
 Row = TypeVar("Row", bound=Base)
 
@@ -59,6 +60,8 @@ def in_sight(principal: Principal, table: type[Base], project: str | None = None
 
     ``project``: only those of the project of this id or name.
     """
+    if principal.cloud_id is not None:
+        return table.__table__.c.id == principal.cloud_id if table is CloudRow else sa.false()
     if project is None:
         return sa.true() if principal.is_admin else within(table, principal.project_id)
     wanted = sa.select(Project.id).where(named(project))
@@ -78,6 +81,8 @@ class Access:
 
         The object may have been deleted since: whoever loads it finds out.
         """
+        if principal.cloud_id is not None:
+            return object_id == principal.cloud_id
         # Its project never changes. Whatever another project has is unknown: it takes a query as if it did not exist.
         return principal.is_admin or self._known.get(object_id) == principal.project_id
 
@@ -85,7 +90,7 @@ class Access:
         """Raise NotFoundError unless the key may touch the object."""
         with self._database.session() as session:
             project = project_of(session, object_id)
-        if project is None or project != principal.project_id:
+        if project is None or project != principal.project_id or principal.cloud_id is not None:
             raise not_found(object_id)
         with self._lock:
             self._known[object_id] = project

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import hmac
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, Protocol
 
 from fastapi import Request
 
@@ -19,15 +20,34 @@ SAFE = ("GET", "HEAD", "OPTIONS")
 
 @dataclass(frozen=True)
 class Credential:
-    """A key, or the token of a session."""
+    """A key, or the token of a session or of a share."""
 
-    kind: Literal["key", "session"]
+    kind: Literal["key", "session", "share"]
     secret: str = field(repr=False)
 
     @property
     def fingerprint(self) -> str:
         """A name for it that gives nothing away."""
         return hashlib.sha256(f"{self.kind} {self.secret}".encode()).hexdigest()
+
+
+class WithSecret(Protocol):
+    """A row that keeps the hash of a secret."""
+
+    @property
+    def secret_hash(self) -> str:
+        """As :func:`secret_hash` makes it."""
+
+
+def secret_hash(secret: str) -> str:
+    """Return what is kept of a secret."""
+    # 256 random bits need no slow hash: there is nothing to guess.
+    return hashlib.sha256(secret.encode()).hexdigest()
+
+
+def is_secret_of(row: WithSecret, secret: str) -> bool:
+    """Return whether a row keeps the hash of this secret."""
+    return hmac.compare_digest(secret_hash(secret), row.secret_hash)
 
 
 def credential_of(request: Request) -> Credential:

@@ -20,6 +20,7 @@ from specimap_service.context import ANSWER_HEADERS, AppContext
 from specimap_service.errors import ForbiddenError, RateLimitedError, UnauthorizedError
 from specimap_service.feature import Feature
 
+SESSION = "/v1/session"
 FAILURES_PER_MINUTE = 60
 """Wrong keys that one address may present a minute before it has to wait."""
 KEYRING = AppState[Keyring]("keyring")
@@ -47,9 +48,31 @@ async def authenticated(request: Request) -> Principal:
     Raises:
         UnauthorizedError: there is no key, or no valid one. RateLimitedError: too many requests, or wrong keys.
         CrossSiteRequestError: it has a session's cookie, and may come from the page of another site.
+        ForbiddenError: it comes by a share's link, and asks for anything but the share's cloud.
         DatabaseUnavailableError: keys cannot be looked up.
     """
-    return await known_by(request, credential_of(request))
+    found = await known_by(request, credential_of(request))
+    check_shared(found, request.method, request.scope["path"])
+    return found
+
+
+def check_shared(principal: Principal, method: str, path: str) -> None:
+    """Check that a share is used to read its own cloud; who else has a link to it is no part of that.
+
+    Raises:
+        ForbiddenError: it asks for anything else, whether that exists or not.
+    """
+    if principal.cloud_id is None or path == SESSION:
+        return
+    cloud = f"/v1/clouds/{principal.cloud_id}"
+    own = path == cloud or path.startswith(f"{cloud}/")
+    reads = method in ("GET", "HEAD") or (method, path) == ("POST", f"{cloud}/spectra")
+    if not (own and reads) or path == f"{cloud}/shares" or path.startswith(f"{cloud}/shares/"):
+        raise ForbiddenError(
+            "The link shows one result and nothing else.",
+            advice="Sign in with a key for more.",
+            cloud_id=principal.cloud_id,
+        )
 
 
 async def known_by(request: Request, credential: Credential) -> Principal:

@@ -16,8 +16,9 @@ from sqlalchemy.orm import Session
 
 from specimap_infra.database import Database, utc_now
 from specimap_infra.ids import new_id
-from specimap_infra.tables import SCOPES, ApiKey
-from specimap_service.auth.credentials import Credential
+from specimap_infra.tables import SCOPES, ApiKey, Share
+from specimap_service.auth import shares
+from specimap_service.auth.credentials import Credential, secret_hash
 from specimap_service.auth.sessions import session_of
 from specimap_service.errors import UnauthorizedError
 
@@ -29,15 +30,18 @@ PREFIX = "spk"
 
 @dataclass(frozen=True)
 class Principal:
-    """The key of a request."""
+    """The key of a request, or the share by whose link somebody came."""
 
     key_id: str
+    """The key's id, the share's for a share: each has turns, a rate and lines in the log of its own."""
     project_id: str
     scopes: frozenset[str]
     rate_per_minute: int
     quota_bytes: int
     session_id: str | None = None
     """The session that the request belongs to, where it comes from a person who signed in with the key."""
+    cloud_id: str | None = None
+    """The one cloud that a share shows; None for a key."""
 
     @property
     def is_admin(self) -> bool:
@@ -72,7 +76,7 @@ def new_key(
         id=row_id,
         project_id=project_id,
         name=name,
-        secret_hash=_hash(secret),
+        secret_hash=secret_hash(secret),
         scopes=[s for s in SCOPES if s in scopes],
         created_at=utc_now(),
         expires_at=expires_at,
@@ -96,16 +100,6 @@ def derived_secret(maker: Credential, salt: str) -> str:
     return hmac.new(maker.secret.encode(), salt.encode(), hashlib.sha256).hexdigest()
 
 
-def is_secret_of(row: ApiKey, secret: str) -> bool:
-    """Return whether a key has this secret."""
-    return hmac.compare_digest(_hash(secret), row.secret_hash)
-
-
-def _hash(secret: str) -> str:
-    # 256 random bits need no slow hash: there is nothing to guess.
-    return hashlib.sha256(secret.encode()).hexdigest()
-
-
 class Keyring:
     """Keys, and sessions made with them, looked up in the database and trusted for two seconds."""
 
@@ -116,11 +110,11 @@ class Keyring:
         self._lock = threading.Lock()
 
     def principal(self, credential: Credential) -> Principal:
-        """Return the principal of a key or of a session.
+        """Return the principal of a key, a session or a share.
 
         Raises:
-            UnauthorizedError: the key is unknown, expired or revoked, or the session has ended; the error does not say
-                which.
+            UnauthorizedError: the key or the share is unknown, expired or revoked, or the session has ended; the error
+                does not say which.
         """
         found = self.trusted(credential)
         if found is not None:
@@ -151,19 +145,25 @@ class Keyring:
 
     def _look_up(self, credential: Credential) -> Principal:
         with self._database.session() as session:
+            share: Share | None = None
+            session_id: str | None = None
             if credential.kind == "key":
-                row, session_id = _key_of(session, credential.secret), None
+                key = _key_of(session, credential.secret)
+            elif credential.kind == "share":
+                share, key = _share_of(session, credential.secret)
             else:
-                row, session_id = _key_of_session(session, credential.secret)
-            if row.last_used_at is None or utc_now() - row.last_used_at > USED_EVERY:
-                row.last_used_at = utc_now()
+                session_id, share, key = _of_session(session, credential.secret)
+            used: ApiKey | Share = share or key
+            if used.last_used_at is None or utc_now() - used.last_used_at > USED_EVERY:
+                used.last_used_at = utc_now()
             return Principal(
-                row.id,
-                row.project_id,
-                frozenset(row.scopes),
-                row.rate_per_minute or self._defaults[0],
-                row.quota_bytes or self._defaults[1],
+                used.id,
+                key.project_id,
+                frozenset(key.scopes) if share is None else shares.SCOPES,
+                key.rate_per_minute or self._defaults[0],
+                key.quota_bytes or self._defaults[1],
                 session_id,
+                None if share is None else share.cloud_id,
             )
 
 
@@ -172,7 +172,7 @@ def _key_of(session: Session, key: str) -> ApiKey:
     name, _, secret = rest.partition("_")
     row = session.get(ApiKey, f"key_{name}") if prefix == PREFIX else None
     # Compared even where there is no such key, so that the time taken gives nothing away.
-    same = hmac.compare_digest(_hash(secret), row.secret_hash if row else "0" * 64)
+    same = hmac.compare_digest(secret_hash(secret), row.secret_hash if row else "0" * 64)
     if row is None or not same or not _is_valid(row):
         raise UnauthorizedError(
             "The key is not valid: unknown, expired or revoked.",
@@ -181,11 +181,24 @@ def _key_of(session: Session, key: str) -> ApiKey:
     return row
 
 
-def _key_of_session(session: Session, token: str) -> tuple[ApiKey, str]:
+def _share_of(session: Session, token: str) -> tuple[Share, ApiKey]:
+    share = shares.share_of(session, token)
+    key = None if share is None else shares.maker_of(session, share)
+    if share is None or key is None or not shares.is_open(share) or not _is_valid(key):
+        raise UnauthorizedError(
+            "The link is not valid: unknown, expired or revoked.", advice="Ask whoever sent it for a new one."
+        )
+    return share, key
+
+
+def _of_session(session: Session, token: str) -> tuple[str, Share | None, ApiKey]:
     found = session_of(session, token)
-    if found is None or not _is_valid(found[1]):
-        raise UnauthorizedError("The session has ended.", advice="Sign in again.")
-    return found[1], found[0].id
+    if found is not None and _is_valid(found[1]):
+        row, key = found
+        share = None if row.share_id is None else session.get(Share, row.share_id)
+        if row.share_id is None or (share is not None and shares.is_open(share)):
+            return row.id, share, key
+    raise UnauthorizedError("The session has ended.", advice="Sign in again, or open the link again.")
 
 
 def _is_valid(row: ApiKey) -> bool:

@@ -56,12 +56,18 @@ async def visible_project(access: AccessDep, principal: Known, project_id: Annot
     return await _check(access, principal, project_id)
 
 
+async def visible_share(access: AccessDep, principal: Known, share_id: Annotated[str, _path("shr")]) -> str:
+    """Return the id of a share."""
+    return await _check(access, principal, share_id)
+
+
 AcquisitionId = Annotated[str, Depends(visible_acquisition)]
 UploadId = Annotated[str, Depends(visible_upload)]
 JobId = Annotated[str, Depends(visible_job)]
 CloudId = Annotated[str, Depends(visible_cloud)]
 KeyId = Annotated[str, Depends(visible_key)]
 ProjectId = Annotated[str, Depends(visible_project)]
+ShareId = Annotated[str, Depends(visible_share)]
 GUARDS: dict[str, Callable[..., Awaitable[str]]] = {
     "acquisition_id": visible_acquisition,
     "upload_id": visible_upload,
@@ -69,5 +75,6 @@ GUARDS: dict[str, Callable[..., Awaitable[str]]] = {
     "cloud_id": visible_cloud,
     "key_id": visible_key,
     "project_id": visible_project,
+    "share_id": visible_share,
 }
 """By the name that an id has in addresses."""

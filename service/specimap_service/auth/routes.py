@@ -14,9 +14,9 @@ from specimap_infra.database import utc_now
 from specimap_infra.projects import found_project
 from specimap_infra.tables import ApiKey, AuditEntry
 from specimap_service.auth.access import in_sight, load
-from specimap_service.auth.credentials import credential_of
+from specimap_service.auth.credentials import credential_of, is_secret_of
 from specimap_service.auth.dependencies import Admin, KeyringDep
-from specimap_service.auth.keys import checked_name, derived_secret, is_secret_of, key_text, new_key
+from specimap_service.auth.keys import checked_name, derived_secret, key_text, new_key
 from specimap_service.auth.object_ids import KeyId
 from specimap_service.context import Context, audit
 from specimap_service.errors import IdempotencyConflictError, RequestInvalidError

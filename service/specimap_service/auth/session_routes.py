@@ -8,33 +8,51 @@ from typing import Annotated
 import sqlalchemy as sa
 from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
+from sqlalchemy.orm import Session as OrmSession
 
 from specimap_infra.database import rows_changed, utc_now
 from specimap_infra.settings import ServiceSettings
-from specimap_infra.tables import ApiKey, Project, SignIn
+from specimap_infra.tables import SCOPES, ApiKey, Project, Share, SignIn
 from specimap_service.auth.credentials import COOKIE, Credential
 from specimap_service.auth.dependencies import KeyringDep, Known, known_by
 from specimap_service.auth.keys import Principal
 from specimap_service.auth.sessions import new_session, session_id
 from specimap_service.context import AppContext, Context, audit
+from specimap_service.errors import UnauthorizedError
 
 router = APIRouter(prefix="/v1", tags=["sessions"])
 
 
+Secret = Annotated[str, StringConstraints(pattern=r"^[\x21-\x7e]{1,200}$")]
+
+
 class SessionRequest(BaseModel):
-    """What a person signs in with."""
+    """What a person signs in with: a key, or a share's token."""
 
-    model_config = ConfigDict(extra="forbid", json_schema_extra={"example": {"key": f"spk_{'0' * 26}_{'0' * 64}"}})
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "example": {"key": f"spk_{'0' * 26}_{'0' * 64}"},
+            "oneOf": [{"required": ["key"]}, {"required": ["share"]}],
+        },
+    )
 
-    key: Annotated[str, StringConstraints(pattern=r"^[\x21-\x7e]{1,200}$")] = Field(description="A key, `spk_…`.")
+    key: Secret = Field(default_factory=str, description="A key, `spk_…`.")
+    share: Secret = Field(default_factory=str, description="What the link of a share holds, `sps_…`.")
+
+    @model_validator(mode="after")
+    def _one(self) -> SessionRequest:
+        if bool(self.key) == bool(self.share):
+            raise ValueError("give either a key or a share")
+        return self
 
 
 class Session(BaseModel):
-    """Who asks: a key, directly or by a session."""
+    """Who asks: a key, directly or by a session, or a share."""
 
-    key_id: str
-    name: str = Field(description="The key's name.")
+    key_id: str = Field(description="Of the key; of the share, for a session that its link made.")
+    name: str = Field(description="Of the key, or of the share.")
     project_id: str
     project: str = Field(description="The project's name.")
     scopes: list[str]
@@ -44,13 +62,14 @@ class Session(BaseModel):
 
 @router.post("/session", status_code=201, operation_id="sessions.create")
 async def create_session(context: Context, request: Request, response: Response, wanted: SessionRequest) -> Session:
-    """Sign in with a key: the answer sets a cookie that stands for it until the session ends.
+    """Sign in with a key or by a share's link: the answer sets a cookie that stands for it until the session ends.
 
     For pages of the service itself: it takes the header `Specimap-Page: 1`, as every later request with the cookie that
     changes something does. A session that the request's cookie names already ends.
     """
     # Wrong keys count like those in headers.
-    principal = await known_by(request, Credential("key", wanted.key))
+    presented = Credential("key", wanted.key) if wanted.key else Credential("share", wanted.share)
+    principal = await known_by(request, presented)
     made, token = await run_in_threadpool(_begin, context, principal, request.cookies.get(COOKIE))
     assert made.expires_at is not None
     seconds = (made.expires_at - utc_now()).total_seconds()
@@ -63,9 +82,9 @@ def get_session(context: Context, principal: Known, response: Response) -> Sessi
     """Tell who asks: the key, its project, what it may do, and until when."""
     response.headers["Cache-Control"] = "no-store"
     with context.database.session() as session:
-        key, project = session.get_one(ApiKey, principal.key_id), session.get_one(Project, principal.project_id)
+        holder = _holder(session, principal)
         row = None if principal.session_id is None else session.get(SignIn, principal.session_id)
-        return _view(key, project, key.expires_at if row is None else row.expires_at)
+        return _view(session, principal, holder, holder.expires_at if row is None else row.expires_at)
 
 
 @router.delete("/session", status_code=204, operation_id="sessions.delete")
@@ -81,10 +100,15 @@ def delete_session(context: Context, principal: Known, keyring: KeyringDep, requ
 def _begin(context: AppContext, principal: Principal, before: str | None) -> tuple[Session, str]:
     _end(context, before)
     with context.database.session() as session:
-        key, project = session.get_one(ApiKey, principal.key_id), session.get_one(Project, principal.project_id)
-        row, token = new_session(session, key, context.settings.session_hours)
-        audit(session, key.id, "session.create", key.id)
-        return _view(key, project, row.expires_at), token
+        holder = _holder(session, principal)
+        share = holder if isinstance(holder, Share) else None
+        key = session.get_one(ApiKey, holder.created_by if isinstance(holder, Share) else holder.id)
+        row, token = new_session(session, key, share, context.settings.session_hours)
+        if share is None:
+            audit(session, key.id, "session.create", key.id)
+        else:
+            audit(session, share.id, "share.open", share.id, cloud=share.cloud_id)
+        return _view(session, principal, holder, row.expires_at), token
 
 
 def _end(context: AppContext, token: str | None) -> None:
@@ -94,18 +118,30 @@ def _end(context: AppContext, token: str | None) -> None:
         row = session.get(SignIn, session_id(token))
         # Two requests may end it at once.
         if row is not None and rows_changed(session.execute(sa.delete(SignIn).where(SignIn.id == row.id))):
-            audit(session, row.key_id, "session.delete", row.key_id)
+            # The share may have been deleted, with its cloud.
+            audit(session, row.share_id or row.key_id, "session.delete", row.key_id)
 
 
-def _view(key: ApiKey, project: Project, expires_at: datetime.datetime | None) -> Session:
+def _holder(session: OrmSession, principal: Principal) -> ApiKey | Share:
+    """Return the key or the share that asks. Raises UnauthorizedError where it has been deleted this moment."""
+    key = session.get(ApiKey, principal.key_id) if principal.cloud_id is None else None
+    found = key or session.get(Share, principal.key_id)
+    if found is None:
+        raise UnauthorizedError("The session has ended.", advice="Sign in again.")
+    return found
+
+
+def _view(
+    session: OrmSession, principal: Principal, holder: ApiKey | Share, expires_at: datetime.datetime | None
+) -> Session:
     return Session(
-        key_id=key.id,
-        name=key.name,
-        project_id=project.id,
-        project=project.name,
-        scopes=key.scopes,
+        key_id=holder.id,
+        name=holder.name,
+        project_id=principal.project_id,
+        project=session.get_one(Project, principal.project_id).name,
+        scopes=[scope for scope in SCOPES if scope in principal.scopes],
         expires_at=expires_at,
-        cloud_id=None,
+        cloud_id=principal.cloud_id,
     )
 
 
