@@ -1,6 +1,7 @@
 /** Read a specimen's id from a barcode with the camera, where the browser can: Chrome on Android does, Safari does not. */
 import { useEffect, useRef, useState } from "preact/hooks";
 import { CameraTrouble, closeCamera, openCamera } from "./photos/camera";
+import { isSpecimenId } from "./specimen-id";
 import { t } from "./texts";
 
 interface Detector {
@@ -20,7 +21,7 @@ export function Barcode({ found }: { found: (text: string) => void }) {
   const [said, setSaid] = useState("");
   if (detectorClass() === null) return <p class="small">{t("scanNone")}</p>;
   const read = (text: string): void => {
-    if (/^[A-Za-z0-9._-]{1,64}$/.test(text)) {
+    if (isSpecimenId(text)) {
       setOpen(false);
       setSaid("");
       found(text);

@@ -4,6 +4,9 @@ import { number } from "../i18n";
 import { Loading, ProblemBox } from "../ui/boxes";
 import { useAcquisition } from "./acquisition-data";
 import { CubePanel } from "./cube/cube-panel";
+import { Dome, nextWords } from "./dome/dome";
+import type { Viewpoints } from "./dome/geometry";
+import { useViewpoints } from "./dome/viewpoints";
 import { JobPanel } from "./job/job-panel";
 import { Notices } from "./notices";
 import { photosOf, tallied, WANTED } from "./photos/checks";
@@ -16,6 +19,7 @@ export function CaptureView({ id }: { id: string }) {
   const all = items.value;
   const mine = useMemo(() => all.filter((item) => item.acquisition === id), [all, id]);
   const photos = useMemo(() => photosOf(files), [files]);
+  const dome = useViewpoints(id, photos);
   if (!acquisition) return problem ? <ProblemBox problem={problem} again={refresh} /> : <Loading />;
   const { usable, again } = tallied(photos);
   const complete = { cube: acquisition.files.cube, white: acquisition.files.white, dark: acquisition.files.dark };
@@ -31,19 +35,37 @@ export function CaptureView({ id }: { id: string }) {
       <Notices unreachable={lost} />
       {problem && !lost && <ProblemBox problem={problem} again={refresh} />}
       <div class="sides">
-        <PhotoPanel acquisition={id} photos={photos} pending={mine.filter(({ role }) => role === "photo")} refresh={refresh} />
+        <PhotoPanel
+          acquisition={id}
+          photos={photos}
+          pending={mine.filter(({ role }) => role === "photo")}
+          next={dome ? nextWords(dome) : null}
+          refresh={refresh}
+        />
         <div class="aside">
-          <section>
-            <p data-testid="count" class={usable >= WANTED ? "good" : ""}>
-              <strong>{t("count", { n: usable, of: WANTED })}</strong>
-            </p>
-            <progress max={WANTED} value={Math.min(usable, WANTED)} aria-label={t("photos")} />
-            {again > 0 && <p class="fair">{t("retakeFirst", { n: again })}</p>}
-          </section>
+          <Count usable={usable} again={again} dome={dome} />
+          {dome && <Dome dome={dome} all={usable} />}
           <CubePanel acquisition={id} files={files} pending={mine.filter(({ role }) => role !== "photo")} complete={complete} refresh={refresh} />
-          <JobPanel acquisition={acquisition} onTheWay={mine.filter(({ state }) => state !== "failed").length} />
+          <JobPanel acquisition={acquisition} enough={dome?.enough === true} onTheWay={mine.filter(({ state }) => state !== "failed").length} />
         </div>
       </div>
     </div>
+  );
+}
+
+/** How many photos there are, and whether they will do. */
+function Count({ usable, again, dome }: { usable: number; again: number; dome: Viewpoints | undefined }) {
+  const enough = dome?.enough === true;
+  return (
+    <section class="count">
+      <p data-testid="count" class={enough ? "good" : ""}>
+        <strong>{t("count", { n: usable, of: WANTED })}</strong>
+      </p>
+      <progress max={WANTED} value={Math.min(usable, WANTED)} aria-label={t("photos")} />
+      <p role="status" data-testid="advice" class={enough ? "good" : "small"}>
+        {enough ? t("enough") : usable >= WANTED ? t("enoughCount", { n: usable }) : t("more", { n: WANTED - usable })}
+      </p>
+      {again > 0 && <p class="fair">{t("retakeFirst", { n: again })}</p>}
+    </section>
   );
 }

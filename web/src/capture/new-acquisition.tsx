@@ -5,13 +5,12 @@ import { go } from "../app/route";
 import { may } from "../app/session";
 import { ProblemBox } from "../ui/boxes";
 import { Barcode } from "./barcode";
+import { PATTERN } from "./specimen-id";
 import { t } from "./texts";
 
 type Request = Schemas["AcquisitionRequest"];
 type Dictionary = NonNullable<Request["dictionary"]>;
 
-/** As the service takes it: a pseudonym. */
-export const PSEUDONYM = /^[A-Za-z0-9._\-]{1,64}$/;
 const DICTIONARIES: readonly Dictionary[] = [
   ...([4, 5, 6, 7] as const).flatMap((bits) => ([50, 100, 250, 1000] as const).map((ids) => `DICT_${bits}X${bits}_${ids}` as Dictionary)),
   ...(["16h5", "25h9", "36h10", "36h11"] as const).map((name) => `DICT_APRILTAG_${name}` as Dictionary),
@@ -82,7 +81,7 @@ export function NewAcquisition() {
         data-testid="new-specimen-id"
         value={specimen}
         onInput={(event) => setSpecimen(event.currentTarget.value)}
-        pattern={PSEUDONYM.source.slice(1, -1)}
+        pattern={PATTERN}
         title={t("specimenHint")}
         maxLength={64}
         required
@@ -111,7 +110,7 @@ export function NewAcquisition() {
           ))}
         </select>
         <label for="accession">{t("accession")}</label>
-        <input id="accession" name="accession" pattern={PSEUDONYM.source.slice(1, -1)} maxLength={64} autocomplete="off" />
+        <input id="accession" name="accession" pattern={PATTERN} maxLength={64} autocomplete="off" />
         <label for="notes">{t("notes")}</label>
         <textarea id="notes" name="notes" maxLength={2000} rows={2} />
       </details>

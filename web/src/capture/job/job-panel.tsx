@@ -4,18 +4,19 @@ import { api, body } from "../../api/client";
 import { asProblem, type Problem } from "../../api/problem";
 import { href } from "../../app/route";
 import { may } from "../../app/session";
+import { doneShare, secondsLeft } from "../../jobs/time-left";
 import { ProblemBox } from "../../ui/boxes";
 import type { Acquisition } from "../acquisition-data";
 import { said } from "../judgement-texts";
 import { WANTED } from "../photos/checks";
 import { t } from "../texts";
 import { isFinal, useJobs } from "./follow";
-import { done, rounded, secondsLeft, stagesOf, type Job } from "./time-left";
+import { rounded, stagesOf, type Job } from "./time-left";
 
 /** Photos without which the service runs no job. */
 const LEAST = 6;
 
-export function JobPanel({ acquisition, onTheWay }: { acquisition: Acquisition; onTheWay: number }) {
+export function JobPanel({ acquisition, enough, onTheWay }: { acquisition: Acquisition; enough: boolean; onTheWay: number }) {
   const jobs = useJobs(acquisition.id);
   const [urgent, setUrgent] = useState(true);
   const [problem, setProblem] = useState<Problem | null>(null);
@@ -58,7 +59,7 @@ export function JobPanel({ acquisition, onTheWay }: { acquisition: Acquisition; 
         </button>
       )}
       {!running && jobs.data && (
-        <Start acquisition={acquisition} onTheWay={onTheWay} busy={busy} before={job} start={() => void start()} urgent={urgent} setUrgent={setUrgent} />
+        <Start acquisition={acquisition} enough={enough} onTheWay={onTheWay} busy={busy} before={job} start={() => void start()} urgent={urgent} setUrgent={setUrgent} />
       )}
       {problem && <ProblemBox problem={problem} />}
     </section>
@@ -67,6 +68,7 @@ export function JobPanel({ acquisition, onTheWay }: { acquisition: Acquisition; 
 
 interface StartProps {
   acquisition: Acquisition;
+  enough: boolean;
   onTheWay: number;
   busy: boolean;
   before: Job | undefined;
@@ -75,13 +77,13 @@ interface StartProps {
   setUrgent: (urgent: boolean) => void;
 }
 
-function Start({ acquisition: { ready, files }, onTheWay, busy, before, start, urgent, setUrgent }: StartProps) {
+function Start({ acquisition: { ready, files }, enough, onTheWay, busy, before, start, urgent, setUrgent }: StartProps) {
   const what = [
     ...(files.photos < LEAST ? [t("missingPhotos", { n: files.photos })] : []),
     ...(files.cube ? [] : [t("missingCube")]),
   ];
   if (!ready && what.length === 0) what.push(t("missingReference"));
-  const few = files.photos < WANTED;
+  const few = !enough && files.photos < WANTED;
   return (
     <>
       {!ready && (
@@ -107,14 +109,14 @@ function Start({ acquisition: { ready, files }, onTheWay, busy, before, start, u
 }
 
 function JobState({ job }: { job: Job }) {
-  const share = job.state === "succeeded" ? 1 : done(job.stage, job.progress);
+  const share = job.state === "succeeded" ? 1 : doneShare(job.stage, job.progress);
   return (
     <div data-testid="job-state" data-state={job.state}>
       <p role="status">
         <strong class={job.state === "succeeded" ? "good" : job.state === "failed" ? "bad" : ""}>
           {job.state === "queued" ? (job.queue_position ? t("queued", { n: job.queue_position }) : t("queuedNext")) : t(job.state)}
         </strong>
-        {job.state === "running" && <TimeLeft job={job} share={share} />}
+        {job.state === "running" && <TimeLeft job={job} />}
       </p>
       {!isFinal(job) && <progress max={1} value={share} aria-label={t("job")} />}
       <ol class="stages">
@@ -148,14 +150,13 @@ function Failure({ job: { error } }: { job: Job }) {
   );
 }
 
-function TimeLeft({ job, share }: { job: Job; share: number }) {
+function TimeLeft({ job }: { job: Job }) {
   const [now, setNow] = useState(Date.now);
   useEffect(() => {
     const timer = setInterval(() => setNow(Date.now()), 1000);
     return () => clearInterval(timer);
   }, []);
-  if (job.started_at === null) return null;
-  const left = secondsLeft(share, (now - Date.parse(job.started_at)) / 1000);
+  const left = secondsLeft(job, now);
   if (left === null) return null;
   const about = rounded(left);
   const time = about < 120 ? t("seconds", { n: about }) : t("minutes", { n: Math.round(about / 60) });

@@ -1,20 +1,7 @@
 import { describe, expect, it } from "vitest";
-import { done, rounded, secondsLeft, stagesOf } from "./time-left";
+import { rounded, stagesOf } from "./time-left";
 
-describe("how far a job is", () => {
-  it("grows with stages and within them", () => {
-    const steps = [done(null, 0.5), done("reconstruct", 0), done("reconstruct", 0.5), done("adjust", 0), done("render", 0.5), done("register", 1)];
-    expect(steps).toEqual([...steps].sort((a, b) => a - b));
-    expect(steps[0]).toBe(0);
-    expect(steps.at(-1)).toBeCloseTo(1);
-  });
-
-  it("does not guess at the start", () => {
-    expect(secondsLeft(0.01, 10)).toBeNull();
-    expect(secondsLeft(0.5, 30)).toBe(30);
-    expect(secondsLeft(1, 30)).toBe(0);
-  });
-
+describe("a running job", () => {
   it.each([
     [1, 5],
     [12, 15],

@@ -1,4 +1,5 @@
 /** The live picture of the rear camera with its shutter. */
+import type { ComponentChildren } from "preact";
 import { useEffect, useRef, useState } from "preact/hooks";
 import { t } from "../texts";
 import { CameraTrouble, closeCamera, openCamera, takeFrame } from "./camera";
@@ -9,11 +10,13 @@ const LEAST_PX = 1280;
 interface Props {
   /** What this photo is taken for, where it takes another's place. */
   hint: string | null;
+  /** How the last photo was judged, and what comes next. */
+  status: ComponentChildren;
   take: (photo: Blob) => void;
   close: () => void;
 }
 
-export function CameraView({ hint, take, close }: Props) {
+export function CameraView({ hint, status, take, close }: Props) {
   const video = useRef<HTMLVideoElement>(null);
   const [trouble, setTrouble] = useState<CameraTrouble | null>(null);
   const [size, setSize] = useState<{ w: number; h: number } | null>(null);
@@ -89,6 +92,7 @@ export function CameraView({ hint, take, close }: Props) {
           {t("closeCamera")}
         </button>
       </div>
+      {status}
       {small && <p class="small fair">{t("cameraSmall", size)}</p>}
     </div>
   );

@@ -1,7 +1,8 @@
 /** What is read from the judgements of photos. */
 import type { Schemas } from "../../api/client";
 
-export type PhotoJudgement = Schemas["PhotoJudgement"];
+/** The corners of markers are for the service's own measuring. */
+export type PhotoJudgement = Omit<Schemas["PhotoJudgement"], "markers">;
 /** As the client types it, which makes arrays of the contract's pairs. */
 export type CubeJudgement = Omit<Schemas["CubeJudgement"], "wavelength_nm"> & { wavelength_nm?: readonly number[] | null };
 export type File = Omit<Schemas["File"], "judgement"> & { judgement: PhotoJudgement | CubeJudgement };

@@ -1,4 +1,5 @@
 /** One photo: its picture, its verdict in words, what was looked at, and the way to take it again. */
+import { number } from "../../i18n";
 import { t as common } from "../../i18n/common";
 import { said } from "../judgement-texts";
 import { t } from "../texts";
@@ -50,6 +51,8 @@ export function PhotoCard({ photo, markers, retake, remove }: Shown) {
 
 const SIGNS = { accepted: "✓", doubtful: "!", refused: "✕" } as const;
 const BLURRED = new Set(["photo_blurred"]);
+/** Share of a photo from which on highlights hide much of the surface. */
+const MOST_CLIPPED = 0.05;
 const BADLY_LIT = new Set(["photo_overexposed", "photo_underexposed"]);
 
 function Checks({ photo: { judgement }, markers }: { photo: Photo; markers: readonly number[] }) {
@@ -65,6 +68,7 @@ function Checks({ photo: { judgement }, markers }: { photo: Photo; markers: read
     <ul class="checks" aria-label={t("checks")}>
       {mark(!BLURRED.has(code), t("sharp"))}
       {mark(!BADLY_LIT.has(code), t("light"))}
+      {judgement.clipped != null && mark(judgement.clipped < MOST_CLIPPED, t("highlights", { share: number(100 * judgement.clipped, judgement.clipped > 0.1 ? 0 : 1) }))}
       {markers.length > 0 && (
         <li class="ids">
           {markers.map((id) => {

@@ -16,10 +16,12 @@ interface Props {
   acquisition: string;
   photos: readonly Photo[];
   pending: readonly Item[];
+  /** Where to stand for the next photo, in words. */
+  next: string | null;
   refresh: () => void;
 }
 
-export function PhotoPanel({ acquisition, photos, pending, refresh }: Props) {
+export function PhotoPanel({ acquisition, photos, pending, next, refresh }: Props) {
   const [camera, setCamera] = useState(false);
   const [replaced, setReplaced] = useState<Photo | null>(null);
   const [refused, setRefused] = useState<string[]>([]);
@@ -62,11 +64,13 @@ export function PhotoPanel({ acquisition, photos, pending, refresh }: Props) {
   const hint = replaced && t("retaking", { name: replaced.label, advice: adviceOf(replaced) });
 
   return (
-    <section ref={top} aria-labelledby="photos-title" class="photos">
+    <>
+    <section ref={top} aria-labelledby="photos-title" class="photos shoot">
       <h2 id="photos-title">{t("photos")}</h2>
       {camera && (
         <CameraView
           hint={hint}
+          status={<LastVerdict photos={photos} pending={pending} next={next} />}
           take={(photo) => void send(photo, photoName(new Date()))}
           close={() => {
             setCamera(false);
@@ -107,6 +111,8 @@ export function PhotoPanel({ acquisition, photos, pending, refresh }: Props) {
         </div>
       )}
       {problem && <ProblemBox problem={problem} />}
+    </section>
+    <section class="all-photos" aria-label={t("photos")}>
       {photos.length + pending.length === 0 && <p class="small">{t("noPhotos")}</p>}
       <ul class="cards" aria-label={t("photos")} data-testid="photo-cards">
         {[...pending].reverse().map((item) => (
@@ -117,8 +123,32 @@ export function PhotoPanel({ acquisition, photos, pending, refresh }: Props) {
         ))}
       </ul>
     </section>
+    </>
   );
 }
+
+/** What the camera's user needs to know before the next photo. */
+function LastVerdict({ photos, pending, next }: Pick<Props, "photos" | "pending" | "next">) {
+  const last = photos.at(-1);
+  const words = last && said(last.judgement.code, last.judgement.reason, last.judgement.advice);
+  return (
+    <div class="last-verdict" role="status" data-testid="last-verdict">
+      {pending.length > 0 ? (
+        <p>{t("checking")}</p>
+      ) : (
+        last &&
+        words && (
+          <p class={VERDICT_COLOURS[last.judgement.verdict]}>
+            <strong>{t("last", { label: last.label, verdict: t(last.judgement.verdict) })}</strong> {words.reason} {words.advice}
+          </p>
+        )
+      )}
+      {next && <p>{next}</p>}
+    </div>
+  );
+}
+
+const VERDICT_COLOURS = { accepted: "good", doubtful: "fair", refused: "bad" } as const;
 
 const ORDER = { refused: 0, doubtful: 0, accepted: 1 } as const;
 
