@@ -184,14 +184,18 @@ def demo(
     stay: Annotated[
         bool | None, typer.Option(help="Let the service go on until Ctrl-C; by default on a terminal.")
     ] = None,
+    show: Annotated[
+        bool, typer.Option("--open", help="Open the result in the browser, and let the service go on until Ctrl-C.")
+    ] = False,
     debug: Debug = False,
 ) -> None:
-    """Run the sample through a service of its own: upload, job, progress, report, link."""
+    """Run the sample through a service of its own: upload, job, progress, report, a link to the result in 3D."""
     listener = progress_listener()
     with reported_errors(listener, debug):
         from specimap_cli.demo import demo as run_demo
 
-        run_demo(samples, out, listener, stay=sys.stdout.isatty() if stay is None else stay, say=typer.echo)
+        stays = show or (sys.stdout.isatty() if stay is None else stay)
+        run_demo(samples, out, listener, stay=stays, show=show, say=typer.echo)
 
 
 def _version(asked: bool) -> None:

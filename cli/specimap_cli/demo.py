@@ -1,12 +1,14 @@
-"""``specimap demo``: the sample through a service of its own: upload, job, progress, report, link."""
+"""``specimap demo``: the sample through a service of its own: upload, job, progress, report, a link to the viewer."""
 
 from __future__ import annotations
 
+import datetime
 import os
 import subprocess
 import sys
 import threading
 import time
+import webbrowser
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,15 +21,20 @@ from specimap_core.errors import BackendUnavailableError, NotFoundError, Specima
 from specimap_core.report.model import Report
 
 if TYPE_CHECKING:
-    from specimap_client import Client
+    from specimap_client import Client, Cloud
 
 START_SECONDS = 60.0
 LISTENS = "Specimap listens on "
 KEY = "spk_"
+LINK_DAYS = 7
 
 
-def demo(samples: Path, out: Path, listener: Listener, *, stay: bool, say: Callable[[str], None]) -> None:
+def demo(
+    samples: Path, out: Path, listener: Listener, *, stay: bool, show: bool = False, say: Callable[[str], None]
+) -> None:
     """Start a service on ``out / "service"``, run the sample through it, leave the results in ``out``.
+
+    ``stay``: let the service go on until Ctrl-C, with a link that opens the result in a browser; ``show`` opens it.
 
     Raises:
         NotFoundError: there is no sample.
@@ -47,7 +54,10 @@ def demo(samples: Path, out: Path, listener: Listener, *, stay: bool, say: Calla
         say(f"The demo's service listens on {url}")
         try:
             with Client(url, key) as client:
-                _run(client, photos, cube, out, listener, say)
+                cloud = _run(client, photos, cube, out, listener, say)
+                if stay:
+                    until = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=LINK_DAYS)
+                    link = cloud.share("demo", until).link
         except JobFailed as failed:
             why = failed.job.error
             raise _error_of_service(
@@ -56,16 +66,20 @@ def demo(samples: Path, out: Path, listener: Listener, *, stay: bool, say: Calla
         except ApiError as refused:
             raise _error_of_service(refused.code, refused.message, refused.advice) from refused
         if stay:
-            say(f"The service goes on: the API is described at {url}/docs, the demo's key is {key}")
+            say(f"The result in 3D: {link}")
+            say(f"The service goes on at {url}, the API is described at {url}/docs. The demo's key is {key}")
             say("Ctrl-C ends it.")
+            if show and not webbrowser.open(link):
+                say("No browser could be opened: open the link yourself.")
             threading.Event().wait()
+    say(f"To see the result in 3D: {program()} demo --open")
     say(f"To serve these results again: export SPECIMAP_DATA_DIR={out / 'service'}; {program()} serve")
     say(f"A key for it: {program()} keys create --name me --scope admin")
 
 
 def _run(
     client: Client, photos: list[Path], cube: Path, out: Path, listener: Listener, say: Callable[[str], None]
-) -> None:
+) -> Cloud:
     acquisition = client.acquisitions.create("SAMPLE-A", notes="The sample that comes with Specimap.")
     with UploadBar() as bar:
         files = client.acquisitions.upload(
@@ -92,7 +106,7 @@ def _run(
     cloud.download(out / "cloud.zarr")
     for name in ("cloud.zarr", "mesh.ply", "preview.png", "report.json"):
         say(f"{name:<12} {out / name}")
-    say(f"{'link':<12} {client.url}/v1/clouds/{cloud.id}")
+    return cloud
 
 
 def _error_of_service(code: str, message: str, advice: str) -> SpecimapError:

@@ -88,8 +88,21 @@ def test_no_job_is_lost_when_everything_is_killed_at_once(tmp_path: Path, small:
 
 
 def test_demo_runs_samples_through_a_service(tmp_path: Path, small: OnDisk) -> None:
-    with running(tmp_path / "unused", "demo", "--out", str(tmp_path / "out"), "--samples", str(small.folder)) as demo:
-        assert demo.process.wait(180) == 0, demo.lines
+    browser, opened = tmp_path / "browser", tmp_path / "opened"
+    browser.write_text(f'#!/bin/sh\nprintf %s "$1" > {opened}\n')
+    browser.chmod(0o755)
+    arguments = ("demo", "--out", str(tmp_path / "out"), "--samples", str(small.folder), "--open")
+    with running(tmp_path / "unused", *arguments, BROWSER=f"{browser} %s") as demo:
+        link = demo.printed("The result in 3D: ", 180)
+        until(opened.exists, 10, "the browser")
+        assert opened.read_text() == link
+        url, token = link.split("/#/shared/")
+        with httpx.Client(base_url=url, headers={"Specimap-Page": "1"}, trust_env=False) as visitor:
+            cloud_id = visitor.post("/v1/session", json={"share": token}).raise_for_status().json()["cloud_id"]
+            assert visitor.get(f"/v1/clouds/{cloud_id}").json()["points"] > 1000
+            assert visitor.get("/v1/jobs").status_code in (403, 404)
+        demo.process.send_signal(signal.SIGINT)
+        demo.process.wait(40)
     out, text = tmp_path / "out", "".join(demo.lines)
     report = Report.model_validate_json((out / "report.json").read_text("utf-8"))
     assert 0.001 < report.corner_3d_mm.median < 0.1
@@ -97,6 +110,6 @@ def test_demo_runs_samples_through_a_service(tmp_path: Path, small: OnDisk) -> N
     assert cloud.n_points == report.coverage.points
     assert float(np.abs(cloud.spectra([0, 1])).max()) > 0.01
     assert (out / "mesh.ply").stat().st_size > 100_000
-    for word in ("14 of 14 files accepted", "4 register", "report.json", "link", "/v1/clouds/cloud_"):
+    for word in ("14 of 14 files accepted", "4 register", "report.json", "in 3D"):
         assert word in text
     assert not processes_of([str(out / "service")])

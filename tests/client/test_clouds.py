@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -264,3 +265,25 @@ class _Cut(httpx.SyncByteStream):
 
     def close(self) -> None:
         self._stream.close()
+
+
+# ---- shares -------------------------------------------------------------------------------------------
+
+
+def test_link_shows_one_result_until_it_is_revoked(live: Live) -> None:
+    until = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=3)
+    share = live.cloud.share("tumour board", until)
+    assert share.link == f"{live.client.url}/#/shared/{share.token}"
+    assert share.token not in repr(share)
+    with httpx.Client(base_url=live.client.url, headers={"Specimap-Page": "1"}, trust_env=False) as visitor:
+        assert visitor.post("/v1/session", json={"share": share.token}).status_code == 201
+        assert visitor.get(f"/v1/clouds/{live.cloud.id}").status_code == 200
+    (listed,) = live.cloud.shares()
+    assert (listed.id, listed.name, listed.revoked_at) == (share.id, "tumour board", None)
+    assert abs(listed.expires_at - until) < datetime.timedelta(seconds=1)
+    live.cloud.revoke_share(listed)
+    assert live.cloud.shares()[0].revoked_at is not None
+    with httpx.Client(base_url=live.client.url, headers={"Specimap-Page": "1"}, trust_env=False) as visitor:
+        assert visitor.post("/v1/session", json={"share": share.token}).status_code == 401
+    with pytest.raises(sc.Refused):
+        live.cloud.share("too long", until + datetime.timedelta(days=300))

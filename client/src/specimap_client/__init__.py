@@ -53,6 +53,7 @@ from specimap_client._models import (
 )
 from specimap_client._report import Report
 from specimap_client._retries import Retries
+from specimap_client._shares import NewShare, Share
 from specimap_client._spectra import Spectra
 from specimap_client._version import __version__
 
@@ -77,6 +78,7 @@ __all__ = [
     "LogLine",
     "MissingExtra",
     "NewKey",
+    "NewShare",
     "NotConfigured",
     "NotFound",
     "Point",
@@ -87,6 +89,7 @@ __all__ = [
     "Report",
     "Retries",
     "ServerError",
+    "Share",
     "SpecimapClientError",
     "Spectra",
     "Timeout",

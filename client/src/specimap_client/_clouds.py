@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from specimap_client import _exports, _labels, _spectra_answers
+from specimap_client import _exports, _labels, _shares, _spectra_answers
 from specimap_client._decode import Model
 from specimap_client._downloads import fetch_zarr
 from specimap_client._errors import MissingExtra
@@ -234,6 +234,23 @@ class Cloud:
         """What was asked for."""
         found = self._session.json("GET", path("clouds", self.id, "exports"))
         return [Export.of(item) for item in found]
+
+    # ---- shares -----------------------------------------------------------------------------------------
+
+    def share(self, name: str, expires_at: datetime.datetime) -> _shares.NewShare:
+        """A link that shows this result, and nothing else, to whoever has it. ``expires_at`` is aware; at most 90 days.
+
+        ``name`` says who it is for; no patient's name.
+        """
+        return _shares.create(self._session, self.id, name, expires_at)
+
+    def shares(self) -> list[_shares.Share]:
+        """The links to this result, also those that have ended."""
+        return _shares.list_all(self._session, self.id)
+
+    def revoke_share(self, share: _shares.Share) -> None:
+        """End a link; it shows nothing within two seconds."""
+        _shares.revoke(self._session, share)
 
     # ---- labels -----------------------------------------------------------------------------------------
 
