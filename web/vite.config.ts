@@ -43,5 +43,5 @@ export default defineConfig({
       },
     }),
   ],
-  test: { environment: "happy-dom", include: ["src/**/*.test.{ts,tsx}"] },
+  test: { include: ["src/**/*.test.{ts,tsx}"] },
 });
