@@ -12,11 +12,13 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
 
-from tests.support.places import ROOT
+from tests.support.places import ROOT, SAMPLES
 
 PAGES = ROOT / "service" / "specimap_service" / "pages"
 AXE = ROOT / "web" / "node_modules" / "axe-core" / "axe.min.js"
-CHROMIUM_VARIABLE = "SPECIMAP_CHROMIUM"
+SCREENSHOTS_VARIABLE = "BROWSER_SCREENSHOTS"
+"""Where the pictures of the documents are made anew: BROWSER_SCREENSHOTS=docs/images."""
+CHROMIUM_VARIABLE = "BROWSER_CHROMIUM"
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 # Chromium looks for updates and translations elsewhere unless it is told not to; WebGL is drawn by software.
 ARGUMENTS = (
@@ -48,6 +50,14 @@ class Window:
         self.page.get_by_role("button", name="Sign in").click()
         expect(self.page.get_by_role("button", name="Sign out")).to_be_visible()
 
+    def picture(self, name: str) -> bytes:
+        """A picture of what is shown, kept in the folder of ``BROWSER_SCREENSHOTS`` if that is set."""
+        picture = self.page.screenshot(animations="disabled")
+        folder = os.environ.get(SCREENSHOTS_VARIABLE)
+        if folder:
+            Path(folder, f"{name}.png").write_bytes(picture)
+        return picture
+
     def faults(self) -> list[str]:
         """Serious accessibility faults of what is shown, as axe finds them."""
         self.page.evaluate(AXE.read_text(encoding="utf-8"))
@@ -64,18 +74,26 @@ def chromium() -> str:
     given = os.environ.get(CHROMIUM_VARIABLE)
     found = given or next(filter(None, map(shutil.which, NAMES)), None)
     if found is None:
-        pytest.skip("there is no Chromium: apt-get install chromium, or name one in SPECIMAP_CHROMIUM")
+        pytest.skip("there is no Chromium: apt-get install chromium, or name one in BROWSER_CHROMIUM")
     if not (PAGES / "index.html").is_file():
         pytest.skip("the web pages are not built: make pages")
     return found
 
 
+def write_camera(path: Path) -> None:
+    """Write what the browser's camera shows: the photos of the sample, a third of a second each, as Motion JPEG."""
+    photos = [photo.read_bytes() for photo in sorted((SAMPLES / "rgb").glob("*.jpg"))]
+    path.write_bytes(b"".join(photo * 10 for photo in photos))
+
+
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     """A headless browser, for a module: while one runs, the process has an event loop that other modules lack."""
-    path = chromium()
+    path, camera = chromium(), tmp_path_factory.mktemp("camera") / "camera.mjpeg"
+    write_camera(camera)
+    fake = ("--use-fake-device-for-media-stream", f"--use-file-for-fake-video-capture={camera}")
     with sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=path, args=list(ARGUMENTS))
+        started = playwright.chromium.launch(executable_path=path, args=[*ARGUMENTS, *fake])
         yield started
         started.close()
 
@@ -100,12 +118,3 @@ def window(context: BrowserContext) -> Iterator[Window]:
     )
     yield window
     assert window.errors == []
-
-
-def screenshot(window: Window, name: str, folder: Path | None) -> bytes:
-    """A picture of what is shown; kept in ``folder`` if given."""
-    picture = window.page.screenshot(animations="disabled")
-    if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / f"{name}.png").write_bytes(picture)
-    return picture

@@ -1,0 +1,135 @@
+"""The whole way in a browser: capture with a network that fails, job, result, spectrum, labels, download."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.support.browser_scene import Window
+from tests.support.places import SAMPLES
+from tests.support.scenes import OnDisk
+from tests.support.serve_scene import Served, running
+
+pytestmark = [pytest.mark.slow, pytest.mark.waits]
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[Served]:
+    with running(tmp_path / "data") as served:
+        yield served
+
+
+def new_acquisition(page: Page, specimen: str) -> None:
+    page.get_by_test_id("new-acquisition").click()
+    page.get_by_test_id("new-specimen-id").fill(specimen)
+    page.get_by_test_id("create-acquisition").click()
+    expect(page.get_by_test_id("capture")).to_be_visible()
+
+
+def test_specimen_is_captured_in_spite_of_the_network_and_becomes_a_cloud(
+    served: Served, window: Window
+) -> None:
+    url, key, page = served.printed("Specimap listens on "), "spk_" + served.printed("spk_"), window.page
+    window.sign_in(url, key)
+    new_acquisition(page, "S-2026-7")
+    assert window.faults() == []
+    photos = sorted((SAMPLES / "rgb").glob("*.jpg"))
+    page.get_by_test_id("pick-photos").set_input_files(photos[:4])
+    expect(page.get_by_test_id("photo-card")).to_have_count(4, timeout=60_000)
+    # The network goes; photos taken meanwhile are kept, over a reload too, and sent when it is back.
+    page.context.set_offline(True)
+    page.get_by_test_id("pick-photos").set_input_files(photos[4:])
+    expect(page.get_by_test_id("notices")).to_contain_text("No connection")
+    expect(page.get_by_test_id("pending-card")).to_have_count(len(photos) - 4)
+    page.context.set_offline(False)
+    page.reload()
+    expect(page.get_by_test_id("photo-card")).to_have_count(len(photos), timeout=120_000)
+    expect(page.get_by_test_id("pending-card")).to_have_count(0)
+    assert float(page.get_by_test_id("dome").get_attribute("data-covered") or 0) > 0.2
+    # Header and data one after the other: the page says what is missing.
+    header = SAMPLES / "hsi" / "hsi.hdr"
+    (data,) = (path for path in header.parent.iterdir() if path != header)
+    page.get_by_test_id("cube-picker").set_input_files(header)
+    expect(page.get_by_test_id("cube-lacks")).to_contain_text("data")
+    page.get_by_test_id("cube-picker").set_input_files(data)
+    expect(page.get_by_test_id("cube-complete")).to_be_visible(timeout=60_000)
+    assert window.faults() == []
+    window.picture("web-capture")
+    page.get_by_test_id("start-job").click()
+    expect(page.get_by_test_id("job-state")).to_have_attribute("data-state", "succeeded", timeout=180_000)
+    page.get_by_test_id("view-cloud").click()
+    expect(page).to_have_url(re.compile("#/view/cloud_"))
+
+
+def test_file_that_is_no_photo_and_a_bad_photo_are_said_and_retaken(
+    served: Served, window: Window, small: OnDisk, tmp_path: Path
+) -> None:
+    url, key, page = served.printed("Specimap listens on "), "spk_" + served.printed("spk_"), window.page
+    window.sign_in(url, key)
+    new_acquisition(page, "S-8")
+    notes = tmp_path / "notes.txt"
+    notes.write_text("no photo")
+    page.get_by_test_id("pick-photos").set_input_files(notes)
+    expect(page.get_by_test_id("no-photo")).to_contain_text("notes.txt is no photo")
+    broken = tmp_path / "broken.jpg"
+    broken.write_bytes(b"\xff\xd8\xff\xe0 broken")
+    page.get_by_test_id("pick-photos").set_input_files(broken)
+    card = page.get_by_test_id("photo-card")
+    expect(card).to_have_attribute("data-verdict", "refused", timeout=30_000)
+    expect(card).to_contain_text("broken.jpg")
+    expect(card).to_contain_text("no known image format")
+    assert window.faults() == []
+
+
+def test_photos_are_taken_with_the_tablets_camera_and_a_bad_one_again(
+    served: Served, window: Window, tmp_path: Path
+) -> None:
+    url, key, page = served.printed("Specimap listens on "), "spk_" + served.printed("spk_"), window.page
+    page.context.grant_permissions(["camera"])
+    window.sign_in(url, key)
+    new_acquisition(page, "S-10")
+    broken = tmp_path / "broken.jpg"
+    broken.write_bytes(b"\xff\xd8\xff\xe0 broken")
+    page.get_by_test_id("pick-photos").set_input_files(broken)
+    card = page.get_by_test_id("photo-card")
+    expect(card).to_have_attribute("data-verdict", "refused", timeout=30_000)
+    # One tap away from taking it again: the refused one goes when the new one is there.
+    card.get_by_test_id("retake").click()
+    expect(page.get_by_test_id("camera")).to_be_visible()
+    expect(page.get_by_test_id("shutter")).to_be_enabled()
+    page.get_by_test_id("shutter").click()
+    expect(card).to_have_attribute("data-verdict", re.compile("accepted|doubtful"), timeout=30_000)
+    expect(card).to_have_count(1)
+    for count in (2, 3):
+        page.wait_for_timeout(700)
+        page.get_by_test_id("shutter").click()
+        expect(card).to_have_count(count, timeout=30_000)
+    assert window.faults() == []
+    with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {key}"}, trust_env=False) as client:
+        (acquisition,) = client.get("/v1/acquisitions").json()["items"]
+        files = client.get(f"/v1/acquisitions/{acquisition['id']}/files").json()
+    assert [file["state"] for file in files] == ["accepted"] * 3
+    assert all(file["judgement"]["marker_ids"] == [0, 1, 2, 3] for file in files)
+
+
+def test_upload_goes_on_when_the_service_starts_again(window: Window, small: OnDisk, tmp_path: Path) -> None:
+    page, photos = window.page, sorted((small.folder / "rgb").iterdir())[:6]
+    with running(tmp_path / "data") as first:
+        url, key = first.printed("Specimap listens on "), "spk_" + first.printed("spk_")
+        window.sign_in(url, key)
+        new_acquisition(page, "S-9")
+        page.get_by_test_id("pick-photos").set_input_files(photos[:2])
+        expect(page.get_by_test_id("photo-card")).to_have_count(2, timeout=60_000)
+    page.get_by_test_id("pick-photos").set_input_files(photos[2:])
+    expect(page.get_by_test_id("notices")).to_contain_text("does not answer", timeout=30_000)
+    with running(tmp_path / "data", SPECIMAP_PORT=url.rpartition(":")[2]) as again:
+        again.printed("Specimap listens on ")
+        expect(page.get_by_test_id("photo-card")).to_have_count(6, timeout=90_000)
+        with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {key}"}, trust_env=False) as client:
+            (acquisition,) = client.get("/v1/acquisitions").json()["items"]
+            assert acquisition["files"]["photos"] == 6
