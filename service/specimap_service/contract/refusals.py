@@ -42,6 +42,7 @@ _TUS: tuple[Refusal, ...] = (
 OWN: dict[str, tuple[Refusal, ...]] = {
     "acquisitions.delete": (infra.JobConflictError, infra.StorageUnavailableError),
     "clouds.get": _CLOUD,
+    "clouds.get_cameras": (*_RANGES, service.CamerasMissingError),
     "clouds.get_corners": _RANGES,
     "deliveries.create": (core.SettingsError, infra.JobConflictError),
     "exports.create": _CLOUD,
