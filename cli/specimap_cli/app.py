@@ -77,7 +77,10 @@ def run(
     json_events: Annotated[bool, typer.Option("--json", help="One JSON line per event instead of a bar.")] = False,
     debug: Debug = False,
 ) -> None:
-    """Reconstruct, adjust, render, register; write cloud.zarr, mesh.ply, report.json, corners.json, preview.png."""
+    """Reconstruct, adjust, render, register.
+
+    Writes cloud.zarr, mesh.ply, report.json, corners.json, cameras.json, preview.png.
+    """
     listener: Listener = json_listener() if json_events else progress_listener()
     with reported_errors(listener, debug), stoppable() as stop_asked:
         # Imported late: `specimap --help` and `specimap info` need none of the 3D libraries.

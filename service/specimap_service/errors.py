@@ -137,6 +137,12 @@ class RequestTimeoutError(SpecimapError, TimeoutError):
     code = "request_timeout"
 
 
+class CamerasMissingError(SpecimapError, FileNotFoundError):
+    """The result comes from a version that kept no cameras."""
+
+    code = "cameras_missing"
+
+
 class TooManyConnectionsError(SpecimapError, RuntimeError):
     """The service has as many connections as it takes; try again after ``details['retry_after_s']`` seconds."""
 

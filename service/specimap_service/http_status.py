@@ -52,6 +52,7 @@ HTTP_STATUS: dict[type[SpecimapError], int] = {
     infra.StageTimeoutError: 500,
     infra.StorageUnavailableError: 503,
     infra.WorkerCrashedError: 500,
+    service.CamerasMissingError: 404,
     service.ChecksumInvalidError: 400,
     service.ChecksumMismatchError: 460,
     service.CrossSiteRequestError: 403,

@@ -48,7 +48,7 @@ def test_version_and_help() -> None:
 
 def test_the_run_has_written_everything(finished: Finished, small: OnDisk) -> None:
     outputs = Outputs(finished.out)
-    for path in (outputs.cloud, outputs.mesh, outputs.report, outputs.corners, outputs.preview):
+    for path in (outputs.cloud, outputs.mesh, outputs.report, outputs.corners, outputs.cameras, outputs.preview):
         assert path.exists()
     assert not list(finished.out.glob(".*.tmp"))
     ids, corners = read_corners(finished.out)
@@ -91,6 +91,18 @@ def test_the_same_run_again_repeats_nothing(finished: Finished, small: OnDisk, t
     assert isinstance(report, dict)
     assert report["reused_stages"] == ["reconstruct", "adjust", "render", "register"]
     assert (out / "report.json").read_bytes() == before
+
+
+@pytest.mark.slow
+def test_a_result_from_before_there_were_cameras_gets_them(finished: Finished, small: OnDisk, tmp_path: Path) -> None:
+    out = finished.copy_to(tmp_path / "out")
+    (out / "cameras.json").unlink()
+    answer = specimap("run", "--photos", small.photos, "--cube", small.header, "--out", out, "--json")
+    assert answer.status == 0
+    report = answer.events[-1]["report"]
+    assert isinstance(report, dict)
+    assert report["reused_stages"] == ["reconstruct", "adjust", "render"]
+    assert (out / "cameras.json").read_bytes() == (finished.out / "cameras.json").read_bytes()
 
 
 @pytest.mark.slow

@@ -108,6 +108,21 @@ def test_corners_are_served_as_they_lie(service: Running, tmp_path: Path) -> Non
     assert client.get(links["corners"], headers={"If-None-Match": answer.headers["etag"]}).status_code == 304
 
 
+def test_cameras_are_served_as_they_lie_and_missed_in_older_results(service: Running, tmp_path: Path) -> None:
+    result = put_result(service, tmp_path / "result")
+    client = service.client(["read"])
+    address = client.get(f"/v1/clouds/{result.cloud_id}").json()["links"]["cameras"]
+    answer = client.get(address)
+    assert answer.content == (result.local / "cameras.json").read_bytes()
+    assert answer.headers["content-type"] == "application/json"
+    assert answer.json()["photos"][0]["camera"]["model"] == "pinhole"
+    assert client.get(address, headers={"If-None-Match": answer.headers["etag"]}).status_code == 304
+    service.storage.delete(f"{result.prefix}/cameras.json")
+    missing = client.get(address)
+    assert (missing.status_code, missing.json()["code"]) == (404, "cameras_missing")
+    assert f"/v1/jobs/{result.job_id}/rerun" in missing.json()["advice"]
+
+
 VERBS = {
     *("append", "cancel", "create", "delete", "follow", "get", "head", "list", "put", "rerun", "revoke", "select"),
     "update",

@@ -30,7 +30,7 @@ END_SECONDS = 3.0
 SHOWN = {
     "sessions.get",
     "sessions.delete",
-    *("clouds.get", "clouds.get_corners", "zarr.get", "zarr.head"),
+    *("clouds.get", "clouds.get_cameras", "clouds.get_corners", "zarr.get", "zarr.head"),
     *("spectra.get_point", "spectra.get_band", "spectra.select"),
     *(f"previews.get_{name}" for name in ("rgb", "pca", "band", "composite", "index", "label")),
     *("labels.list", "labels.get", "labels.list_versions", "labels.get_values"),

@@ -227,6 +227,7 @@ CASES: dict[tuple[str, str], Case] = {
     ("GET", "/v1/clouds"): Case("read"),
     ("GET", CLOUD): _read(),
     ("GET", f"{CLOUD}/corners"): _read(),
+    ("GET", f"{CLOUD}/cameras"): _read(),
     ("GET", f"{CLOUD}/zarr/{{key}}"): _read(),
     ("HEAD", f"{CLOUD}/zarr/{{key}}"): _read(),
     ("GET", f"{CLOUD}/points/{{index}}"): _read(),

@@ -15,6 +15,7 @@ from specimap_core.cloud.labels import write_label
 from specimap_core.cloud.preview import write_preview
 from specimap_core.cloud.writer import write_cloud
 from specimap_core.register.figures import MethodFigures, Quartiles, Spread
+from specimap_core.report.cameras import Cameras
 from specimap_core.report.model import (
     Coverage,
     CubeCameraFigures,
@@ -32,6 +33,7 @@ from specimap_infra.database import utc_now
 from specimap_infra.ids import new_id
 from specimap_infra.projects import DEFAULT_PROJECT
 from specimap_infra.tables import Acquisition, CloudRow, Job, LabelVersion
+from specimap_service.contract.examples import recorded
 from tests.support.cloud_scene import FakeCube, counts, scene
 from tests.support.service_scene import Running
 
@@ -82,6 +84,8 @@ def put_result(
         for i in range(4)
     }
     (local / "corners.json").write_text(json.dumps(corners), encoding="utf-8")
+    cameras = recorded()["schemas"]["Cameras"]
+    (local / "cameras.json").write_text(Cameras.model_validate(cameras).text(), encoding="utf-8")
     write_preview(cloud, local / "preview.png")
 
     job, cloud_id, new_acquisition = new_id("job"), new_id("cloud"), acquisition_id is None

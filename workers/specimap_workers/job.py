@@ -37,7 +37,7 @@ PROGRESS_SECONDS = 0.4
 """Least time between two progress events of a stage: a person sees no more, and each is a transaction."""
 HELD_SECONDS = 3.0
 """Longest pause between two processes of a stage: the slot waits meanwhile, and others may be in the queue."""
-RESULTS = ("cloud.zarr", "mesh.ply", "corners.json", "preview.png", "report.json")
+RESULTS = ("cloud.zarr", "mesh.ply", "corners.json", "cameras.json", "preview.png", "report.json")
 SHEET = "photos.jpg"
 """Not there where stage 1 was kept from a version that made none."""
 

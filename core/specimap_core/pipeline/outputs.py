@@ -54,6 +54,11 @@ class Outputs:
         return self.folder / "corners.json"
 
     @property
+    def cameras(self) -> Path:
+        """The cameras of the photos and of the cube; not there in results of versions that kept none."""
+        return self.folder / "cameras.json"
+
+    @property
     def preview(self) -> Path:
         """Principal components on the top view."""
         return self.folder / "preview.png"
@@ -123,7 +128,7 @@ def staged(outputs: Outputs) -> Iterator[Outputs]:
             outputs.sheet.unlink(missing_ok=True)
             if aside.sheet.exists():
                 replace(aside.sheet, outputs.sheet)
-            for name in ("cloud", "mesh", "corners", "preview", "report"):
+            for name in ("cloud", "mesh", "corners", "cameras", "preview", "report"):
                 replace(getattr(aside, name), getattr(outputs, name))
         finally:
             remove(aside.folder)

@@ -1,4 +1,4 @@
-"""Stage 4: register the cube, then write mesh, corners, cloud, preview and report."""
+"""Stage 4: register the cube, then write mesh, corners, cameras, cloud, preview and report."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from specimap_core.errors import MarkersMissingInCubeError
 from specimap_core.json_text import json_text
 from specimap_core.notices import Notices
 from specimap_core.pipeline.artefacts import Stage1
+from specimap_core.pipeline.cameras import cameras_of
 from specimap_core.pipeline.clock import Clock
 from specimap_core.pipeline.outputs import Outputs, staged
 from specimap_core.pipeline.report_builder import RunRecord, build_report
@@ -84,6 +85,7 @@ def register_stage(
             write_mesh_ply(aside.mesh, registered.surface.caster.mesh)
             named = zip(adjusted.marker_ids, adjusted.corners, strict=True)
             write_text(aside.corners, json_text({str(i): np.round(c, 6).tolist() for i, c in named}, indent=1))
+            write_text(aside.cameras, cameras_of(stage1, adjusted, registered).text())
             write_cloud(
                 aside.cloud,
                 registered.points,

@@ -92,7 +92,8 @@ def _digest(path: Path) -> str:
 
 def _finished(outputs: Outputs, key: str) -> Report | None:
     """The report of an earlier run with the same inputs and settings, if all its results are there."""
-    if not all(p.exists() for p in (outputs.cloud, outputs.mesh, outputs.corners, outputs.preview)):
+    results = (outputs.cloud, outputs.mesh, outputs.corners, outputs.cameras, outputs.preview)
+    if not all(p.exists() for p in results):
         return None
     try:
         report = Report.model_validate_json(outputs.report.read_text(encoding="utf-8"))

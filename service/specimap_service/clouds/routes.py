@@ -10,6 +10,8 @@ import sqlalchemy as sa
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
+from specimap_core.errors import NotFoundError
+from specimap_core.report.cameras import Cameras
 from specimap_infra.tables import Acquisition, CloudRow, Job
 from specimap_service.auth.access import in_sight
 from specimap_service.auth.dependencies import Reader
@@ -17,6 +19,7 @@ from specimap_service.auth.object_ids import CloudId
 from specimap_service.byte_ranges import ranged_response
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import Context
+from specimap_service.errors import CamerasMissingError
 from specimap_service.paging import After, InProject, Limit, Page, Sort, page_of, paged
 
 router = APIRouter(prefix="/v1", tags=["clouds"])
@@ -97,6 +100,7 @@ def show_cloud(principal: Reader, clouds: CloudsDep, cloud_id: CloudId) -> Cloud
                 "exports": f"{here}/exports",
                 "mesh": f"{here}/exports/mesh-ply",
                 "corners": f"{here}/corners",
+                "cameras": f"{here}/cameras",
             },
         )
 
@@ -113,3 +117,23 @@ def get_corners(
     """Return the markers' corners: `{"<id>": [[x, y, z] * 4]}`, mm, in the marker frame."""
     record = clouds.record(cloud_id)
     return ranged_response(request, context.storage, f"{record.prefix}/corners.json", "application/json")
+
+
+@router.get(
+    "/clouds/{cloud_id}/cameras",
+    response_class=Response,
+    responses={200: {"model": Cameras}},
+    operation_id="clouds.get_cameras",
+)
+def get_cameras(
+    context: Context, principal: Reader, clouds: CloudsDep, request: Request, cloud_id: CloudId
+) -> Response:
+    """Return the cameras of the photos and of the cube, in the marker frame, mm."""
+    record = clouds.record(cloud_id)
+    try:
+        return ranged_response(request, context.storage, f"{record.prefix}/cameras.json", "application/json")
+    except NotFoundError as error:
+        raise CamerasMissingError(
+            "The result comes from a version that kept no cameras.",
+            advice=f"Repeat the job with POST /v1/jobs/{record.job_id}/rerun: its new result has them.",
+        ) from error

@@ -43,6 +43,7 @@ OWN: dict[str, tuple[Refusal, ...]] = {
     "acquisitions.delete": (infra.JobConflictError, infra.StorageUnavailableError),
     "acquisitions.list_viewpoints": _TURNS,
     "clouds.get": _CLOUD,
+    "clouds.get_cameras": (*_RANGES, service.CamerasMissingError),
     "clouds.get_corners": _RANGES,
     "deliveries.create": (core.SettingsError, infra.JobConflictError),
     "exports.create": _CLOUD,
