@@ -1,0 +1,122 @@
+/** Bands of all points: a coarse picture at once, from an even sample of spectra; the exact one when it has come. */
+import { fetched } from "../../api/client";
+import { readNpy } from "./npy";
+
+/** Values of a sample of spectra that are read at most; two thirds of what the service gives in one page. */
+const SAMPLE_VALUES = 12_000_000;
+const KEPT = 12;
+const NPY = { Accept: "application/x-npy" };
+
+export interface Band {
+  values: Float32Array<ArrayBuffer>;
+  exact: boolean;
+}
+
+export interface Sample {
+  /** Each `step`-th point is in the sample. */
+  step: number;
+  count: number;
+  /** Spectra, (count, bands). */
+  spectra: Float32Array;
+}
+
+/** Choose the step of an even sample: consecutive points are neighbours, so 16 of them are a row of a tile. */
+export function sampleStep(points: number, bands: number): number {
+  let step = 16;
+  while ((points / step) * bands > SAMPLE_VALUES || points / step > 100_000) step *= 2;
+  return step;
+}
+
+/** A band of all points, each with the value of its neighbour in the sample. */
+export function bandOfSample(sample: Sample, band: number, bands: number, points: number): Float32Array<ArrayBuffer> {
+  const out = new Float32Array(points);
+  for (let i = 0; i < sample.count; i++) {
+    const start = i * sample.step;
+    out.fill(sample.spectra[i * bands + band] ?? NaN, start, Math.min(start + sample.step, points));
+  }
+  return out;
+}
+
+export class BandSource {
+  private readonly kept = new Map<number, Float32Array<ArrayBuffer>>();
+  private readonly coming = new Map<number, Promise<Float32Array<ArrayBuffer>>>();
+  private sampled: Promise<Sample> | null = null;
+  private known: Sample | null = null;
+
+  constructor(
+    private readonly cloudId: string,
+    private readonly points: number,
+    private readonly bands: number,
+  ) {}
+
+  /** What is there of a band at this moment. */
+  now(band: number): Band | null {
+    const kept = this.kept.get(band);
+    if (kept) {
+      this.keep(band, kept);
+      return { values: kept, exact: true };
+    }
+    if (!this.known) return null;
+    return { values: bandOfSample(this.known, band, this.bands, this.points), exact: false };
+  }
+
+  /** All values of a band. */
+  exact(band: number): Promise<Float32Array<ArrayBuffer>> {
+    const kept = this.kept.get(band);
+    if (kept) return Promise.resolve(kept);
+    let coming = this.coming.get(band);
+    if (!coming) {
+      coming = fetched(`/v1/clouds/${this.cloudId}/bands/${band}`, { headers: NPY })
+        .then(async (answer) => {
+          const values = readNpy(await answer.arrayBuffer()).values as Float32Array<ArrayBuffer>;
+          this.keep(band, values);
+          return values;
+        })
+        .finally(() => this.coming.delete(band));
+      this.coming.set(band, coming);
+    }
+    return coming;
+  }
+
+  /** Whether a band is being read: the service reads few at a time. */
+  get busy(): boolean {
+    return this.coming.size > 0;
+  }
+
+  /** Spectra of an even sample of the points; read once. */
+  sample(): Promise<Sample> {
+    this.sampled ??= this.readSample().catch((error: unknown) => {
+      this.sampled = null;
+      throw error;
+    });
+    return this.sampled;
+  }
+
+  get sampleNow(): Sample | null {
+    return this.known;
+  }
+
+  private async readSample(): Promise<Sample> {
+    const step = sampleStep(this.points, this.bands);
+    const count = Math.ceil(this.points / step);
+    // The middle of each run stands for it best.
+    const indices = Array.from({ length: count }, (_, i) => Math.min(i * step + step / 2, this.points - 1));
+    const answer = await fetched(`/v1/clouds/${this.cloudId}/spectra`, {
+      method: "POST",
+      headers: { ...NPY, "Content-Type": "application/json" },
+      body: JSON.stringify({ select: { indices }, limit: count }),
+    });
+    const spectra = readNpy(await answer.arrayBuffer()).values as Float32Array;
+    this.known = { step, count, spectra };
+    return this.known;
+  }
+
+  private keep(band: number, values: Float32Array<ArrayBuffer>): void {
+    this.kept.delete(band);
+    this.kept.set(band, values);
+    for (const oldest of this.kept.keys()) {
+      if (this.kept.size <= KEPT) break;
+      this.kept.delete(oldest);
+    }
+  }
+}

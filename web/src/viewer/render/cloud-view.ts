@@ -1,0 +1,314 @@
+/** The three-dimensional view: draws a cloud when something has changed, and not otherwise. */
+import {
+  BufferAttribute,
+  BufferGeometry,
+  Color,
+  Group,
+  LinearSRGBColorSpace,
+  Matrix4,
+  PerspectiveCamera,
+  Points,
+  Scene,
+  Vector3,
+  WebGLRenderer,
+  type Object3D,
+} from "three";
+import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
+import { CHUNK, NOWHERE, type PointCloud } from "../data/point-cloud";
+import { levelOrder } from "../data/shard-plan";
+import { DrawBudget } from "./draw-budget";
+import { pointMaterial, ringMaterial } from "./materials";
+import { pixelsPerMm, project, type Plane, type Projection } from "./projection";
+
+export type CameraState = readonly [number, number, number, number, number, number];
+export interface Ring {
+  place: readonly [number, number, number];
+  rgb: readonly [number, number, number];
+}
+
+const FIELD_OF_VIEW = 30;
+const REST_MS = 180;
+
+export class CloudView {
+  readonly renderer: WebGLRenderer;
+  readonly camera = new PerspectiveCamera(FIELD_OF_VIEW, 1, 1, 2000);
+  readonly controls: OrbitControls;
+  /** What parts of the page add: surface, cameras, lines. */
+  readonly extras = new Group();
+  /** Four bytes a point; call {@link recolour} after writing. */
+  readonly colours: Uint8Array<ArrayBuffer>;
+  /** Called after the camera has come to rest. */
+  onRest: () => void = () => undefined;
+  /** Called with each frame drawn. */
+  onFrame: () => void = () => undefined;
+  private readonly scene = new Scene();
+  private readonly material = pointMaterial();
+  private readonly coarseMaterial = pointMaterial();
+  private readonly ringMaterial = ringMaterial();
+  private readonly points: Points;
+  private readonly coarse: Points;
+  private readonly rings = new Points(new BufferGeometry(), this.ringMaterial);
+  private readonly budget: DrawBudget;
+  private readonly spacing: number;
+  private readonly watch: ResizeObserver;
+  private frame = 0;
+  private lastFrame = 0;
+  private movedAt = 0;
+  private rest: ReturnType<typeof setTimeout> | undefined;
+  private section: Plane | null = null;
+  private pointScale = 1;
+
+  /** Throws where the browser has no WebGL 2. */
+  constructor(
+    readonly canvas: HTMLCanvasElement,
+    readonly cloud: PointCloud,
+  ) {
+    this.renderer = new WebGLRenderer({ canvas, antialias: true, powerPreference: "high-performance" });
+    // Colours are measured or chosen: they go to the screen as they are.
+    this.renderer.outputColorSpace = LinearSRGBColorSpace;
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    this.camera.up.set(0, 0, 1);
+    this.controls = new OrbitControls(this.camera, canvas);
+    this.controls.enableDamping = false;
+    this.controls.addEventListener("change", () => this.moved());
+    this.colours = new Uint8Array(cloud.points * 4).fill(255);
+    this.spacing = cloud.spacing();
+    this.budget = new DrawBudget(cloud.points);
+    this.points = this.fullPoints();
+    this.coarse = this.coarsePoints();
+    for (const object of [this.points, this.coarse, this.rings]) object.frustumCulled = false;
+    this.rings.renderOrder = 10;
+    this.scene.add(this.points, this.coarse, this.extras, this.rings);
+    this.watch = new ResizeObserver(() => this.resize());
+    this.watch.observe(canvas);
+    this.home();
+  }
+
+  dispose(): void {
+    this.watch.disconnect();
+    cancelAnimationFrame(this.frame);
+    clearTimeout(this.rest);
+    this.controls.dispose();
+    this.scene.traverse((object) => disposeOf(object));
+    this.renderer.dispose();
+  }
+
+  // ---- what is shown ----------------------------------------------------------------------------------
+
+  /** Take positions that have been read: they replace the coarse picture there. */
+  positionsRead(start: number, points: number): void {
+    const position = attribute(this.points, "position");
+    position.addUpdateRange(start * 3, points * 3);
+    position.needsUpdate = true;
+    const centres = attribute(this.coarse, "position");
+    (centres.array as Float32Array).fill(NOWHERE, Math.floor(start / CHUNK) * 3, Math.ceil((start + points) / CHUNK) * 3);
+    centres.needsUpdate = true;
+    this.coarse.visible = !this.cloud.complete;
+    this.draw();
+  }
+
+  /** Show the colours that have been written. */
+  recolour(): void {
+    attribute(this.points, "colour").needsUpdate = true;
+    if (this.coarse.visible) this.colourCoarse();
+    this.draw();
+  }
+
+  setRings(rings: readonly Ring[]): void {
+    const geometry = new BufferGeometry();
+    geometry.setAttribute("position", new BufferAttribute(Float32Array.from(rings.flatMap((r) => [...r.place])), 3));
+    geometry.setAttribute("colour", new BufferAttribute(Uint8Array.from(rings.flatMap((r) => [...r.rgb, 255])), 4, true));
+    this.rings.geometry.dispose();
+    this.rings.geometry = geometry;
+    this.rings.visible = rings.length > 0;
+    this.draw();
+  }
+
+  /** Show half a space alone; null: all. */
+  setSection(plane: Plane | null): void {
+    this.section = plane;
+    for (const material of [this.material, this.coarseMaterial]) material.uniforms.plane.value.fromArray(plane ?? [0, 0, 0, 1]);
+    this.draw();
+  }
+
+  get shownHalf(): Plane | null {
+    return this.section;
+  }
+
+  setPointScale(scale: number): void {
+    this.pointScale = scale;
+    this.draw();
+  }
+
+  showPoints(shown: boolean): void {
+    this.points.visible = shown;
+    this.draw();
+  }
+
+  setBackground(colour: string): void {
+    this.scene.background = new Color().setStyle(colour, LinearSRGBColorSpace);
+    this.draw();
+  }
+
+  // ---- camera -----------------------------------------------------------------------------------------
+
+  get cameraState(): CameraState {
+    const { position: p, target: t } = { position: this.camera.position, target: this.controls.target };
+    return [p.x, p.y, p.z, t.x, t.y, t.z];
+  }
+
+  setCamera([x, y, z, tx, ty, tz]: CameraState): void {
+    this.camera.position.set(x, y, z);
+    this.controls.target.set(tx, ty, tz);
+    this.controls.update();
+    this.draw();
+  }
+
+  /** Look at the whole cloud from above and a little from the front. */
+  home(from: readonly [number, number, number] = [0, -0.55, 1]): void {
+    const { low, high } = this.cloud.bounds();
+    const centre = low.map((value, i) => (value + (high[i] ?? 0)) / 2);
+    const reach = Math.hypot(...low.map((value, i) => (high[i] ?? 0) - value)) / 2;
+    const far = reach / Math.sin((FIELD_OF_VIEW * Math.PI) / 360) / Math.min(1, this.camera.aspect) / 1.12;
+    const unit = far / Math.hypot(...from);
+    const [x = 0, y = 0, z = 0] = centre;
+    this.setCamera([x + from[0] * unit, y + from[1] * unit, z + from[2] * unit, x, y, z]);
+  }
+
+  /** Turn by angles (rad) around the target, or come nearer by a factor. For the keyboard. */
+  orbit(around: number, up: number, nearer = 1): void {
+    const offset = this.camera.position.clone().sub(this.controls.target);
+    const polar = Math.min(Math.PI - 1e-3, Math.max(1e-3, Math.acos(offset.z / offset.length()) - up));
+    const azimuth = Math.atan2(offset.y, offset.x) + around;
+    const length = offset.length() / nearer;
+    this.camera.position
+      .set(Math.sin(polar) * Math.cos(azimuth), Math.sin(polar) * Math.sin(azimuth), Math.cos(polar))
+      .multiplyScalar(length)
+      .add(this.controls.target);
+    this.controls.update();
+    this.moved();
+  }
+
+  /** How places come onto the canvas, in CSS pixels. */
+  projection(): Projection {
+    this.placeCamera();
+    const matrix = new Matrix4().multiplyMatrices(this.camera.projectionMatrix, this.camera.matrixWorldInverse);
+    return { matrix: matrix.elements, width: this.canvas.clientWidth, height: this.canvas.clientHeight };
+  }
+
+  /** Where a point lies on the canvas, in CSS pixels; null behind the camera. */
+  project(index: number): { x: number; y: number; depth: number } | null {
+    return project(this.projection(), ...this.cloud.place(index));
+  }
+
+  // ---- drawing ----------------------------------------------------------------------------------------
+
+  /** Draw with the next frame. */
+  draw(): void {
+    if (this.frame === 0) this.frame = requestAnimationFrame((now) => this.drawNow(now));
+  }
+
+  /** Draw all points at once, for a picture of this state. `perMm` of a larger picture's tiles may differ. */
+  drawAll(perMm = pixelsPerMm(this.projection()) * this.renderer.getPixelRatio()): void {
+    this.placeCamera();
+    this.drawPoints(this.cloud.points, perMm);
+    this.renderer.render(this.scene, this.camera);
+  }
+
+  private drawNow(now: number): void {
+    this.frame = 0;
+    const moving = now - this.movedAt < REST_MS;
+    if (moving && now - this.lastFrame < 500) this.budget.took(now - this.lastFrame);
+    this.canvas.dataset.frameMs = String(Math.round(now - this.lastFrame));
+    this.lastFrame = now;
+    this.placeCamera();
+    this.drawPoints(moving ? this.budget.moving : this.cloud.points, pixelsPerMm(this.projection()) * this.renderer.getPixelRatio());
+    this.renderer.render(this.scene, this.camera);
+    this.onFrame();
+  }
+
+  private drawPoints(count: number, perMm: number): void {
+    this.points.geometry.setDrawRange(0, count);
+    // Fewer points are larger, so that the surface stays closed.
+    const wider = Math.min(6, Math.sqrt(this.cloud.points / Math.max(1, count)));
+    const { size, perMm: scale, least } = this.material.uniforms;
+    size.value = this.spacing * 1.6 * wider * this.pointScale;
+    least.value = Math.min(2, wider) * this.renderer.getPixelRatio() * 0.75;
+    scale.value = perMm;
+    this.coarseMaterial.uniforms.size.value = this.spacing * 22;
+    this.coarseMaterial.uniforms.perMm.value = perMm;
+  }
+
+  private moved(): void {
+    this.movedAt = performance.now();
+    this.draw();
+    clearTimeout(this.rest);
+    this.rest = setTimeout(() => {
+      this.draw();
+      this.onRest();
+    }, REST_MS + 20);
+  }
+
+  /** The nearest and farthest that is drawn hug the cloud: depth is as fine as it can be. */
+  private placeCamera(): void {
+    const { low, high } = this.cloud.bounds();
+    const centre = new Vector3(...low).add(new Vector3(...high)).multiplyScalar(0.5);
+    const reach = new Vector3(...high).distanceTo(centre) * 1.5 + 1;
+    const distance = this.camera.position.distanceTo(centre);
+    // Cameras of photos stand well outside of the cloud.
+    this.camera.far = distance + Math.max(reach, this.extras.children.length > 0 ? 2000 : 0);
+    this.camera.near = Math.max(0.5, distance - reach - (this.extras.children.length > 0 ? 500 : 0));
+    this.camera.updateProjectionMatrix();
+    this.camera.updateMatrixWorld();
+  }
+
+  private resize(): void {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    if (width === 0 || height === 0) return;
+    this.renderer.setSize(width, height, false);
+    this.camera.aspect = width / height;
+    this.draw();
+  }
+
+  private fullPoints(): Points {
+    const geometry = new BufferGeometry();
+    geometry.setAttribute("position", new BufferAttribute(this.cloud.xyz, 3));
+    geometry.setAttribute("colour", new BufferAttribute(this.colours, 4, true));
+    geometry.setIndex(new BufferAttribute(levelOrder(this.cloud.points), 1));
+    return new Points(geometry, this.material);
+  }
+
+  /** One large point for each chunk of the cloud, at the middle of its box. */
+  private coarsePoints(): Points {
+    const { boxes } = this.cloud;
+    const chunks = boxes.length / 6;
+    const centres = Float32Array.from({ length: chunks * 3 }, (_, i) => {
+      const at = Math.floor(i / 3) * 6 + (i % 3);
+      return ((boxes[at] ?? 0) + (boxes[at + 3] ?? 0)) / 2;
+    });
+    const geometry = new BufferGeometry();
+    geometry.setAttribute("position", new BufferAttribute(centres, 3));
+    geometry.setAttribute("colour", new BufferAttribute(new Uint8Array(chunks * 4).fill(255), 4, true));
+    return new Points(geometry, this.coarseMaterial);
+  }
+
+  private colourCoarse(): void {
+    const colour = attribute(this.coarse, "colour");
+    for (let chunk = 0; chunk < colour.count; chunk++) {
+      // A point from the middle of the chunk stands for it.
+      const from = Math.min(chunk * CHUNK + CHUNK / 2, this.cloud.points - 1) * 4;
+      for (let c = 0; c < 4; c++) (colour.array as Uint8Array)[chunk * 4 + c] = this.colours[from + c] ?? 0;
+    }
+    colour.needsUpdate = true;
+  }
+}
+
+function attribute(points: Points, name: string): BufferAttribute {
+  return points.geometry.getAttribute(name) as BufferAttribute;
+}
+
+function disposeOf(object: Object3D): void {
+  const { geometry, material } = object as Partial<Points>;
+  geometry?.dispose();
+  if (material && !Array.isArray(material)) material.dispose();
+}
