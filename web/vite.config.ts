@@ -1,9 +1,24 @@
 /// <reference types="vitest/config" />
-import { defineConfig } from "vite";
+import { defineConfig, type Plugin } from "vite";
 import { VitePWA } from "vite-plugin-pwa";
 
 /** Where the service looks for the built pages. */
 const PAGES = "../service/specimap_service/pages";
+
+/**
+ * Leave out the GLSL of three.js's own materials, 125 kB: the viewer draws with shaders of its own
+ * (src/viewer/render/materials.ts) and uses none of them.
+ */
+const withoutShaderChunks: Plugin = {
+  name: "without-shader-chunks",
+  apply: "build",
+  transform(code, id) {
+    if (!id.endsWith("three/build/three.module.js")) return undefined;
+    const lean = code.replace(/^(?:var|const) (\w+) = "(?:[^"\\]|\\.)*";$/gm, 'const $1 = "";');
+    if (code.length - lean.length < 100_000) throw new Error("three.js keeps its shader chunks otherwise than before");
+    return { code: lean, map: null };
+  },
+};
 
 export default defineConfig({
   base: "./",
@@ -16,8 +31,20 @@ export default defineConfig({
     modulePreload: { polyfill: false },
     chunkSizeWarningLimit: 700,
   },
+  // Workers are modules: what they decode with is loaded when it is needed.
+  worker: { format: "es" },
+  // zarrita offers to load codecs of numcodecs; src/viewer/data/blosc.ts stands for the one that clouds need.
+  resolve: {
+    alias: Object.fromEntries(
+      ["blosc", "lz4", "zstd"].map((name) => [
+        `numcodecs/${name}`,
+        new URL("src/viewer/data/no-codec.ts", import.meta.url).pathname,
+      ]),
+    ),
+  },
   server: { proxy: { "/v1": process.env.SPECIMAP_URL ?? "http://127.0.0.1:8000" } },
   plugins: [
+    withoutShaderChunks,
     VitePWA({
       registerType: "prompt",
       injectRegister: null,

@@ -76,7 +76,7 @@ export function encode(state: ViewState, first: ViewState): URLSearchParams {
   const out = new URLSearchParams();
   const put = <K extends keyof ViewState>(name: string, key: K, write: (value: NonNullable<ViewState[K]>) => string): void => {
     const value = state[key];
-    if (value !== null && JSON.stringify(value) !== JSON.stringify(first[key])) out.set(name, write(value as NonNullable<ViewState[K]>));
+    if (value !== null && JSON.stringify(value) !== JSON.stringify(first[key])) out.set(name, write(value));
   };
   const list = (values: readonly number[]): string => values.map(short).join(",");
   put("camera", "camera", list);

@@ -70,7 +70,8 @@ export class Colouring {
     switch (state.mode) {
       case "photo":
         copyColours(cloud.rgb, into);
-        return written();
+        written();
+        return;
       case "band":
         return this.inTwoSteps([state.band], current, ([values], exact) => this.paintValues(values, state, exact, into, written));
       case "ratio":
@@ -87,7 +88,8 @@ export class Colouring {
         });
       case "height":
         if (!this.heights || !cloud.complete) this.heights = heightsOf(cloud);
-        return this.paintValues(this.heights, state, true, into, written);
+        this.paintValues(this.heights, state, true, into, written);
+        return;
       case "sigma": {
         const values = (await loader.array("sigma_mm", 1)) as Float32Array;
         if (current()) this.paintValues(values, state, true, into, written);
@@ -97,13 +99,15 @@ export class Colouring {
         const flags = (await loader.array("flags", 1)) as Uint8Array;
         if (!current()) return;
         flagColours(flags, into);
-        return written();
+        written();
+        return;
       }
       case "pca": {
         const [pixels, picture] = await Promise.all([loader.array("hsi_pixel", 2), this.componentPicture()]);
         if (!current()) return;
         fromPicture(pixels as Uint16Array, picture, into);
-        return written();
+        written();
+        return;
       }
     }
   }

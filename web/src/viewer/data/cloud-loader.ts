@@ -1,7 +1,7 @@
 /** The page's side of the reader: a cloud that fills up while it is read. */
 import { signal } from "@preact/signals";
 import { BASE } from "../../api/client";
-import { problemFrom, type Problem } from "../../api/problem";
+import { Problem, problemFrom } from "../../api/problem";
 import { PointCloud } from "./point-cloud";
 import type { Ask, Decode, Tell, Values } from "./cloud-reader.worker";
 import type { Span } from "./shard-plan";
@@ -37,7 +37,7 @@ export class CloudLoader {
     this.opened = new Promise((resolve) => {
       this.worker.onmessage = ({ data }: MessageEvent<Tell>) => this.take(data, resolve);
     });
-    this.worker.onerror = () => (this.problem.value = problemFrom("", 0));
+    this.worker.onerror = (event) => (this.problem.value = broken(event.message));
     this.ask({ kind: "open", url: `${BASE}/v1/clouds/${cloudId}/zarr` });
   }
 
@@ -87,7 +87,7 @@ export class CloudLoader {
           // Parts of an array of two axes begin at `start` times its width.
           all.set(values, start * Math.round(length / (this.cloud?.points ?? length)));
         },
-        done: () => (all && got === length ? resolve(all) : reject(problemFrom("", 0))),
+        done: () => (all && got === length ? resolve(all) : reject(broken(`${name} is not whole`))),
         failed: reject,
       });
       this.ask({ kind: "array", id, name });
@@ -115,7 +115,7 @@ export class CloudLoader {
         this.waiting.value = message.seconds;
         return;
       case "failed": {
-        const problem = problemFrom(message.text, message.status);
+        const problem = message.status === 0 ? broken(message.text) : problemFrom(message.text, message.status);
         if (message.id === undefined) this.problem.value = problem;
         else this.end(message.id)?.failed(problem);
       }
@@ -147,6 +147,10 @@ export class CloudLoader {
   private ask(message: Ask): void {
     this.worker.postMessage(message);
   }
+}
+
+function broken(text: string): Problem {
+  return new Problem("page_failed", text, "", 0);
 }
 
 function like(values: Values, length: number): Values {

@@ -1,5 +1,6 @@
 /** Reads a cloud's arrays apart from the page, so that decoding never holds up a picture. */
-import { open, root, get, slice, withConsolidatedMetadata, type Array as ZarrArray, type DataType } from "zarrita";
+import { get, open, registry, root, slice, withConsolidatedMetadata, type Array as ZarrArray, type DataType } from "zarrita";
+import { bloscCodec } from "./blosc";
 import { Refusal, ShardStore } from "./shard-store";
 import { shardsFromMiddle, type Span } from "./shard-plan";
 
@@ -26,6 +27,8 @@ export interface Decode {
   offset: number;
   fill: number | null;
 }
+
+registry.set("blosc", () => Promise.resolve(bloscCodec));
 
 const tell = (message: Tell, moved: Transferable[] = []): void => postMessage(message, { transfer: moved });
 const stopped = new Set<number>();
@@ -58,15 +61,15 @@ async function openCloud(url: string): Promise<void> {
   const patience = { signal: ended.signal, waiting: (seconds: number) => tell({ kind: "waiting", seconds }) };
   const store = new ShardStore(url, patience, (key) => !key.startsWith("/spectra/"));
   cloud = (async () => {
-    const group = await open(root(await withConsolidatedMetadata(store)), { kind: "group" });
-    const spectra = await open(group.resolve("spectra"), { kind: "array" });
+    const group = await open.v3(root(await withConsolidatedMetadata(store, { format: "v3" })), { kind: "group" });
+    const spectra = await open.v3(group.resolve("spectra"), { kind: "array" });
     const attrs = spectra.attrs as { scale_factor?: number; add_offset?: number; _FillValue?: number };
     const decode = { scale: attrs.scale_factor ?? 1, offset: attrs.add_offset ?? 0, fill: attrs._FillValue ?? null };
     const [points = 0, bands = 0] = spectra.shape;
     tell({ kind: "opened", attributes: group.attrs, points, bands, decode });
     return {
       store,
-      array: async (name: string) => (await open(group.resolve(name), { kind: "array" })) as never,
+      array: async (name: string) => (await open.v3(group.resolve(name), { kind: "array" })) as never,
     };
   })();
   const opened = await cloud;

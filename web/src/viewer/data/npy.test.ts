@@ -9,7 +9,7 @@ it.each([Uint8Array.of(0, 1, 255), Uint16Array.of(0, 300, 65535)])("reads what i
 it("reads an array as NumPy 1.0 writes it", () => {
   // np.save of np.arange(2, dtype="<f4").reshape(2, 1)
   const head = "\x93NUMPY\x01\x00\x76\x00{'descr': '<f4', 'fortran_order': False, 'shape': (2, 1), }".padEnd(127) + "\n";
-  const bytes = Uint8Array.from([...head].map((c) => c.charCodeAt(0)).concat([0, 0, 0, 0, 0, 0, 0x80, 0x3f]));
+  const bytes = Uint8Array.from([...Array.from(head, (c) => c.charCodeAt(0)), 0, 0, 0, 0, 0, 0, 0x80, 0x3f]);
   expect(readNpy(bytes.buffer)).toEqual({ shape: [2, 1], values: Float32Array.of(0, 1) });
 });
 

@@ -55,6 +55,7 @@ export class CloudView {
   private lastFrame = 0;
   private movedAt = 0;
   private rest: ReturnType<typeof setTimeout> | undefined;
+  private handMoved = false;
   private section: Plane | null = null;
   private pointScale = 1;
 
@@ -104,7 +105,7 @@ export class CloudView {
     (centres.array as Float32Array).fill(NOWHERE, Math.floor(start / CHUNK) * 3, Math.ceil((start + points) / CHUNK) * 3);
     centres.needsUpdate = true;
     this.coarse.visible = !this.cloud.complete;
-    this.draw();
+    this.drawCoarsely();
   }
 
   /** Show the colours that have been written. */
@@ -217,7 +218,8 @@ export class CloudView {
 
   private drawNow(now: number): void {
     this.frame = 0;
-    const moving = now - this.movedAt < REST_MS;
+    // While points are read, each part of them is a frame.
+    const moving = now - this.movedAt < REST_MS || !this.cloud.complete;
     if (moving && now - this.lastFrame < 500) this.budget.took(now - this.lastFrame);
     this.canvas.dataset.frameMs = String(Math.round(now - this.lastFrame));
     this.lastFrame = now;
@@ -240,12 +242,19 @@ export class CloudView {
   }
 
   private moved(): void {
+    this.drawCoarsely();
+    this.handMoved = true;
+  }
+
+  /** Draw what the machine can in a frame, and all when nothing has come for a while. */
+  private drawCoarsely(): void {
     this.movedAt = performance.now();
     this.draw();
     clearTimeout(this.rest);
     this.rest = setTimeout(() => {
       this.draw();
-      this.onRest();
+      if (this.handMoved) this.onRest();
+      this.handMoved = false;
     }, REST_MS + 20);
   }
 

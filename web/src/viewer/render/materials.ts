@@ -1,5 +1,5 @@
 /** Shaders of points and surface. Colours pass through as they are: no lighting and no tone mapping on measured values. */
-import { GLSL3, ShaderMaterial, Vector4, type IUniform } from "three";
+import { GLSL3, RawShaderMaterial, Vector4, type IUniform } from "three";
 
 interface Uniforms extends Record<string, IUniform> {
   /** Diameter of a point, mm. */
@@ -12,15 +12,21 @@ interface Uniforms extends Record<string, IUniform> {
 }
 
 /** A material with its uniforms typed. */
-export type CloudMaterial = ShaderMaterial & { uniforms: Uniforms };
+export type CloudMaterial = RawShaderMaterial & { uniforms: Uniforms };
 
+const VERTEX = `
+      precision highp float;
+      uniform mat4 modelViewMatrix, projectionMatrix;
+      in vec3 position;`;
+const FRAGMENT = `
+      precision highp float;`;
 const SECTION = "if (dot(vec4(position, 1.0), plane) < 0.0) gl_Position = vec4(0.0, 0.0, 2.0, 1.0);";
 
 export function pointMaterial(): CloudMaterial {
-  return new ShaderMaterial({
+  return new RawShaderMaterial({
     glslVersion: GLSL3,
     uniforms: { size: { value: 0.1 }, perMm: { value: 1000 }, least: { value: 1 }, plane: { value: new Vector4(0, 0, 0, 1) } },
-    vertexShader: `
+    vertexShader: `${VERTEX}
       in vec4 colour;
       uniform float size, perMm, least;
       uniform vec4 plane;
@@ -32,7 +38,7 @@ export function pointMaterial(): CloudMaterial {
         shown = colour.rgb;
         ${SECTION}
       }`,
-    fragmentShader: `
+    fragmentShader: `${FRAGMENT}
       in vec3 shown;
       out vec4 pixel;
       void main() { pixel = vec4(shown, 1.0); }`,
@@ -40,13 +46,15 @@ export function pointMaterial(): CloudMaterial {
 }
 
 /** The surface in the colours of the nearest points, darker where it turns away, so that its form shows. */
-export function surfaceMaterial(): ShaderMaterial {
-  return new ShaderMaterial({
+export function surfaceMaterial(): RawShaderMaterial {
+  return new RawShaderMaterial({
     glslVersion: GLSL3,
     uniforms: { plane: { value: new Vector4(0, 0, 0, 1) }, shade: { value: 1 } },
     side: 2,
-    vertexShader: `
+    vertexShader: `${VERTEX}
       in vec4 colour;
+      in vec3 normal;
+      uniform mat3 normalMatrix;
       uniform vec4 plane;
       out vec3 shown, turned, towards;
       out float kept;
@@ -58,7 +66,7 @@ export function surfaceMaterial(): ShaderMaterial {
         towards = -seen.xyz;
         kept = dot(vec4(position, 1.0), plane);
       }`,
-    fragmentShader: `
+    fragmentShader: `${FRAGMENT}
       in vec3 shown, turned, towards;
       in float kept;
       uniform float shade;
@@ -72,13 +80,13 @@ export function surfaceMaterial(): ShaderMaterial {
 }
 
 /** Rings of a fixed size in pixels, in front of everything: chosen points, the linked cursor. */
-export function ringMaterial(): ShaderMaterial {
-  return new ShaderMaterial({
+export function ringMaterial(): RawShaderMaterial {
+  return new RawShaderMaterial({
     glslVersion: GLSL3,
     uniforms: { diameter: { value: 18 } },
     depthTest: false,
     transparent: true,
-    vertexShader: `
+    vertexShader: `${VERTEX}
       in vec4 colour;
       uniform float diameter;
       out vec4 shown;
@@ -87,7 +95,7 @@ export function ringMaterial(): ShaderMaterial {
         gl_PointSize = diameter;
         shown = colour;
       }`,
-    fragmentShader: `
+    fragmentShader: `${FRAGMENT}
       in vec4 shown;
       uniform float diameter;
       out vec4 pixel;

@@ -30,31 +30,32 @@ export function pixelsPerMm(p: Projection): number {
   return 0.5 * p.height * Math.hypot(m[1], m[5], m[9]);
 }
 
+/** Points so little behind the nearest one belong to the same surface, mm. */
+const SURFACE_MM = 1;
+
 /**
- * The point under a place on the screen: among those within `radius` pixels the nearest to the camera, where a pixel
- * aside counts as the length it covers. null where there is none.
+ * The point under a place on the screen: of those within `radius` pixels the surface nearest to the camera, where a
+ * pixel aside counts as three times the length it covers; of that surface the point nearest to the place.
+ * null where there is none.
  */
 export function pick(cloud: PointCloud, p: Projection, x: number, y: number, radius: number, plane: Plane | null): number | null {
   const { xyz } = cloud;
   const perMm = pixelsPerMm(p);
-  let best: number | null = null;
-  let least = Infinity;
+  const found: { index: number; depth: number; aside: number; score: number }[] = [];
   cloud.forChunks(mayShow(cloud, p, { x0: x - radius, y0: y - radius, x1: x + radius, y1: y + radius }), (start, stop) => {
     for (let i = start; i < stop; i++) {
-      const px = (xyz[i * 3] as number), py = (xyz[i * 3 + 1] as number), pz = (xyz[i * 3 + 2] as number);
+      const px = xyz[i * 3] as number, py = xyz[i * 3 + 1] as number, pz = xyz[i * 3 + 2] as number;
       if (plane && plane[0] * px + plane[1] * py + plane[2] * pz + plane[3] < 0) continue;
       const at = project(p, px, py, pz);
       if (!at) continue;
       const aside = Math.hypot(at.x - x, at.y - y);
-      if (aside > radius) continue;
-      const score = at.depth + (3 * aside * at.depth) / perMm;
-      if (score < least) {
-        least = score;
-        best = i;
-      }
+      if (aside <= radius) found.push({ index: i, depth: at.depth, aside, score: at.depth + (3 * aside * at.depth) / perMm });
     }
   });
-  return best;
+  const front = found.reduce((least, { score }) => Math.min(least, score), Infinity);
+  let best: (typeof found)[number] | null = null;
+  for (const one of found) if (one.depth <= front + SURFACE_MM && (!best || one.aside < best.aside)) best = one;
+  return best?.index ?? null;
 }
 
 export interface ScreenBox {
