@@ -192,7 +192,14 @@ def fitting_dictionaries(images: list[Bytes]) -> dict[str, int]:
 
 def shared_sightings(images: list[Bytes], dictionary: str) -> int:
     """Sightings of a dictionary's markers in ``images`` (each (H, W) uint8), of ids that two images share."""
-    found = ({d.marker_id for d in detect_markers(image, dictionary, expected=0)} for image in images)
-    shown = Counter(i for ids in found for i in ids)
+    shown: Counter[int] = Counter()
+    left = len(images)
+    for image in images:
+        ids = {d.marker_id for d in detect_markers(image, dictionary, expected=0)}
+        shown.update(ids)
+        # Where all images but one show nothing, two cannot share anything.
+        left -= not ids
+        if left < 2:
+            return 0
     # Texture decodes as a marker now and then, but not twice as the same one.
     return sum(n for n in shown.values() if n >= 2)

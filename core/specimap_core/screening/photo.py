@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -88,12 +88,15 @@ def judge_photo(path: Path, dictionary: str, others: Others, most_pixels: int = 
     clipped = float((photo.image.min(2) >= 254).mean())
     facts |= {"sharpness": round(sharpness, 6), "clipped": round(clipped, 4), "marker_ids": ids}
     facts["markers"] = _corners(found, max(width, height) / max(grey.shape))
-    for doubt in (
-        _blurred(sharpness, isotropy, others.sharpness),
-        _exposure(clipped, grey),
-        _markers(ids, grey, dictionary),
-        _foreign((width, height), others.sizes),
-    ):
+    # One after the other: looking for markers of other dictionaries takes longer than all the rest.
+    checks: tuple[Callable[[], Verdict | None], ...] = (
+        lambda: _blurred(sharpness, isotropy, others.sharpness),
+        lambda: _exposure(clipped, grey),
+        lambda: _markers(ids, grey, dictionary),
+        lambda: _foreign((width, height), others.sizes),
+    )
+    for check in checks:
+        doubt = check()
         if doubt is not None:
             return Verdict(doubt.verdict, doubt.code, doubt.reason, doubt.advice, facts | doubt.facts)
     return Verdict(facts=facts)
@@ -149,7 +152,8 @@ def _markers(ids: list[int], grey: NDArray[np.uint8], dictionary: str) -> Verdic
             "doubtful", "few_markers", reason, "Take it again with two or more markers whole in the picture."
         )
     # Twice at different sizes: texture that reads as a marker by chance does not do so again.
-    both = [grey, np.asarray(cv2.resize(grey, None, fx=0.75, fy=0.75), np.uint8)]
+    # The smaller one first: where it shows nothing, the other is not searched.
+    both = [np.asarray(cv2.resize(grey, None, fx=0.75, fy=0.75), np.uint8), grey]
     fitting = fitting_dictionaries(both)
     mirrored = shared_sightings([np.ascontiguousarray(image[:, ::-1]) for image in both], dictionary)
     # In dictionaries of few bits, mirror images of another one's markers read, too.
