@@ -75,10 +75,9 @@ export interface Said {
   advice: string;
 }
 
-/** Say a code in the reader's language. English readers get the service's own, more exact words. */
+/** Say a code in the reader's language. What is wrong, English readers get in the service's own, more exact words. */
 export function said(code: string | null, reason: string, advice: string): Said {
-  if (code === null || (language.value === "en" && reason)) return { reason, advice };
-  if (!(code in en)) return { reason, advice };
+  if (code === null || !(code in en)) return { reason, advice };
   const [what = "", todo = ""] = t(code as keyof typeof en).split("\n");
-  return { reason: what, advice: todo };
+  return { reason: language.value === "en" && reason ? reason : what, advice: todo };
 }

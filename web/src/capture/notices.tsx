@@ -34,7 +34,9 @@ export function Notices({ unreachable }: { unreachable: boolean }) {
       )}
       {full.value && (
         <div class="box problem row">
-          <span class="fill">{t("full", { message: full.value.message })}</span>
+          <span class="fill">
+            {t("full")} <span lang="en">({full.value.message})</span>
+          </span>
           <button type="button" onClick={againAll}>
             {common("retry")}
           </button>

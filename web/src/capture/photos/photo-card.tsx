@@ -109,7 +109,7 @@ export function ItemState({ item }: { item: Item }) {
         {item.state === "sending" && t("sending", { share })}
         {item.state === "checking" && t("checking")}
         {item.state === "resting" && t("resting", { s: Math.max(Math.ceil((item.retryAt - Date.now()) / 1000), 1) })}
-        {item.state === "asking" && t("asking", { share })}
+        {item.state === "asking" && t("asking")}
         {item.state === "failed" && words && (
           <span class="bad">
             {words.reason} {words.advice}

@@ -1,7 +1,7 @@
 /** The files of this browser on their way to the service. It belongs to no page: it goes on while others are shown. */
 import { signal } from "@preact/signals";
 import { asProblem } from "../../api/problem";
-import { session } from "../../app/session";
+import { session, sessionLost } from "../../app/session";
 import type { File as StoredFile } from "../photos/checks";
 import { due, isSame, meaningOf, nextDue, step, type Event, type Item, type Role, type Trouble } from "./item";
 import { send, type Sending } from "./send";
@@ -15,6 +15,9 @@ export const full = signal<Trouble | null>(null);
 export const forgetful = signal(false);
 /** Whether another tab of this browser sends. */
 export const elsewhere = signal(false);
+
+/** How long the queue waits by itself for room. */
+const FULL_PAUSE_MS = 60_000;
 
 type Listener = (item: Item, file: StoredFile) => void;
 const listeners = new Set<Listener>();
@@ -166,8 +169,14 @@ async function start(item: Item): Promise<void> {
   } catch (thrown) {
     const { code, message, advice, status, retryAfter } = asProblem(thrown);
     const trouble = { code, message, advice, status };
-    if (meaningOf(trouble) === "full") full.value = trouble;
-    if (meaningOf(trouble) === "signed-out") session.value = null;
+    if (meaningOf(trouble) === "full") {
+      full.value = trouble;
+      setTimeout(againAll, FULL_PAUSE_MS);
+    }
+    if (meaningOf(trouble) === "signed-out") {
+      sessionLost.value = true;
+      session.value = null;
+    }
     change(item.id, { type: "failed", trouble, retryAfter, now: Date.now() });
   } finally {
     running.delete(item.id);
