@@ -17,6 +17,11 @@ onSignedOut(() => {
   session.value = null;
 });
 
+// A page that was opened without a network goes on by itself when it is there.
+addEventListener("online", () => {
+  if (sessionProblem.value) void findSession();
+});
+
 /** Find out whether somebody is signed in. */
 export async function findSession(): Promise<void> {
   try {

@@ -1,8 +1,8 @@
 /** Everything of one acquisition on one page: photos on one side; viewpoints, cube and job on the other. */
-import { useMemo } from "preact/hooks";
+import { useMemo, useState } from "preact/hooks";
 import { number } from "../i18n";
 import { Loading, ProblemBox } from "../ui/boxes";
-import { useAcquisition } from "./acquisition-data";
+import { deleteFile, useAcquisition } from "./acquisition-data";
 import { CubePanel } from "./cube/cube-panel";
 import { Dome, nextWords } from "./dome/dome";
 import type { Viewpoints } from "./dome/geometry";
@@ -20,10 +20,17 @@ export function CaptureView({ id }: { id: string }) {
   const mine = useMemo(() => all.filter((item) => item.acquisition === id), [all, id]);
   const photos = useMemo(() => photosOf(files), [files]);
   const dome = useViewpoints(id, photos);
+  const [camera, setCamera] = useState(false);
   if (!acquisition) return problem ? <ProblemBox problem={problem} again={refresh} /> : <Loading />;
   const { usable, again } = tallied(photos);
   const complete = { cube: acquisition.files.cube, white: acquisition.files.white, dark: acquisition.files.dark };
   const lost = problem !== null && (problem.status === 0 || problem.status >= 500);
+
+  const retakeCube = async (): Promise<void> => {
+    for (const file of files) if (file.role === "cube") await deleteFile(id, file.id);
+    refresh();
+    document.getElementById("cube-title")?.scrollIntoView({ block: "start" });
+  };
 
   return (
     <div class="page capture" data-testid="capture">
@@ -39,6 +46,8 @@ export function CaptureView({ id }: { id: string }) {
           acquisition={id}
           photos={photos}
           pending={mine.filter(({ role }) => role === "photo")}
+          camera={camera}
+          setCamera={setCamera}
           next={dome ? nextWords(dome) : null}
           refresh={refresh}
         />
@@ -46,7 +55,12 @@ export function CaptureView({ id }: { id: string }) {
           <Count usable={usable} again={again} dome={dome} />
           {dome && <Dome dome={dome} all={usable} />}
           <CubePanel acquisition={id} files={files} pending={mine.filter(({ role }) => role !== "photo")} complete={complete} refresh={refresh} />
-          <JobPanel acquisition={acquisition} enough={dome?.enough === true} onTheWay={mine.filter(({ state }) => state !== "failed").length} />
+          <JobPanel
+            acquisition={acquisition}
+            enough={dome?.enough === true}
+            onTheWay={mine.filter(({ state }) => state !== "failed").length}
+            retake={{ photos: () => setCamera(true), cube: retakeCube }}
+          />
         </div>
       </div>
     </div>
@@ -65,7 +79,19 @@ function Count({ usable, again, dome }: { usable: number; again: number; dome: V
       <p role="status" data-testid="advice" class={enough ? "good" : "small"}>
         {enough ? t("enough") : usable >= WANTED ? t("enoughCount", { n: usable }) : t("more", { n: WANTED - usable })}
       </p>
-      {again > 0 && <p class="fair">{t("retakeFirst", { n: again })}</p>}
+      {again > 0 && (
+        <p class="row tight">
+          <span class="fair fill">{t("retakeFirst", { n: again })}</span>
+          <button type="button" onClick={showFirst}>
+            {t("show")}
+          </button>
+        </p>
+      )}
     </section>
   );
+}
+
+/** Bring the first photo that should be taken again into sight; such photos come first. */
+function showFirst(): void {
+  document.querySelector(".photo.refused, .photo.doubtful")?.scrollIntoView({ block: "center" });
 }

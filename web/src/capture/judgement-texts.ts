@@ -2,7 +2,7 @@
 import { language, texts } from "../i18n";
 
 /** Each text: what is wrong, then what to do. */
-const en = {
+export const en = {
   photo_unreadable: "It is no photo that can be opened.\nTake another, or choose the photo as the camera made it.",
   photo_raw: "It is a raw file.\nExport it as JPEG, or take another.",
   photo_too_large: "It has too many pixels.\nTake it with the camera's normal setting.",
@@ -27,7 +27,9 @@ const en = {
   marker_ids_duplicate: "Several markers have the same number.\nUse each marker once, then take photos and cube again.",
   depth_not_found: "No surface was found in the photos.\nTake more, neighbouring ones 10 to 20 degrees apart.",
   edge_implausible: "The edge of the markers cannot be right.\nMeasure the black square in millimetres, and make a new acquisition.",
-  photos_too_few: "Too few photos can be used.\nTake more, sharp and with all markers.",
+  too_few_photos: "Too few photos can be used.\nTake more, sharp and with all markers.",
+  photos_not_connected: "The photos do not hang together.\nTake more, neighbouring ones 10 to 20 degrees apart, with two markers or more.",
+  registration_failed: "The cube cannot be laid onto the photos.\nTake the cube again, with all markers in view, lit and sharp.",
   result_insufficient: "The result covers too little of the specimen.\nTake more photos, from the sides that are missing.",
   state_conflict: "The service has such a file already, or works on it.\nDelete the one that is there first.",
   payload_too_large: "It is larger than the service takes.\nAsk the administrator for a higher limit.",
@@ -60,7 +62,9 @@ const it: typeof en = {
   marker_ids_duplicate: "Più marcatori hanno lo stesso numero.\nUsa ogni marcatore una volta sola, poi rifai foto e cubo.",
   depth_not_found: "Nelle foto non è stata trovata una superficie.\nScattane altre, a 10–20 gradi l'una dall'altra.",
   edge_implausible: "Il lato dei marcatori non può essere giusto.\nMisura il quadrato nero in millimetri, e crea una nuova acquisizione.",
-  photos_too_few: "Troppo poche foto sono utilizzabili.\nScattane altre, nitide e con tutti i marcatori.",
+  too_few_photos: "Troppo poche foto sono utilizzabili.\nScattane altre, nitide e con tutti i marcatori.",
+  photos_not_connected: "Le foto non si collegano tra loro.\nScattane altre, a 10–20 gradi l'una dall'altra, con due o più marcatori.",
+  registration_failed: "Il cubo non si sovrappone alle foto.\nRifai il cubo, con tutti i marcatori in vista, illuminati e nitidi.",
   result_insufficient: "Il risultato copre troppo poco del campione.\nScatta altre foto, dai lati che mancano.",
   state_conflict: "Il servizio ha già un file così, o ci sta lavorando.\nElimina prima quello che c'è.",
   payload_too_large: "È più grande di quanto il servizio accetti.\nChiedi all'amministratore un limite più alto.",

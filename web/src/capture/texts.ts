@@ -21,6 +21,8 @@ const en = {
   hold: "Neither specimen nor markers may move until photos and cube are taken.",
 
   photos: "Photos",
+  taken: "Photos that are there",
+  show: "Show",
   camera: "Camera",
   openCamera: "Open the camera",
   closeCamera: "Close the camera",
@@ -141,7 +143,10 @@ const en = {
   rerun: "Try again with the files that are there now",
   stageDone: "done",
   stageNow: "now",
+  stageFailed: "failed",
   stageAhead: "to come",
+  retakePhotos: "Take more photos",
+  retakeCube: "Delete the cube and take it again",
 };
 
 export type CaptureKey = keyof typeof en;
@@ -166,6 +171,8 @@ const it: typeof en = {
   hold: "Né il campione né i marcatori devono muoversi finché non sono presi foto e cubo.",
 
   photos: "Foto",
+  taken: "Foto presenti",
+  show: "Mostra",
   camera: "Fotocamera",
   openCamera: "Apri la fotocamera",
   closeCamera: "Chiudi la fotocamera",
@@ -286,7 +293,10 @@ const it: typeof en = {
   rerun: "Riprova con i file che ci sono ora",
   stageDone: "fatto",
   stageNow: "ora",
+  stageFailed: "non riuscito",
   stageAhead: "da fare",
+  retakePhotos: "Scatta altre foto",
+  retakeCube: "Elimina il cubo e rifallo",
 };
 
 export const t = texts({ en, it });

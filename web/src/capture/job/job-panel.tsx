@@ -11,12 +11,21 @@ import { said } from "../judgement-texts";
 import { WANTED } from "../photos/checks";
 import { t } from "../texts";
 import { isFinal, useJobs } from "./follow";
+import { remedyOf } from "./remedy";
 import { rounded, stagesOf, type Job } from "./time-left";
 
 /** Photos without which the service runs no job. */
 const LEAST = 6;
 
-export function JobPanel({ acquisition, enough, onTheWay }: { acquisition: Acquisition; enough: boolean; onTheWay: number }) {
+interface Props {
+  acquisition: Acquisition;
+  enough: boolean;
+  onTheWay: number;
+  /** Open the camera; delete the cube, so that another one can be sent. */
+  retake: { photos: () => void; cube: () => Promise<void> };
+}
+
+export function JobPanel({ acquisition, enough, onTheWay, retake }: Props) {
   const jobs = useJobs(acquisition.id);
   const [urgent, setUrgent] = useState(true);
   const [problem, setProblem] = useState<Problem | null>(null);
@@ -52,7 +61,7 @@ export function JobPanel({ acquisition, enough, onTheWay }: { acquisition: Acqui
   return (
     <section aria-labelledby="job-title" class="job">
       <h2 id="job-title">{t("job")}</h2>
-      {job && <JobState job={job} />}
+      {job && <JobState job={job} retake={{ ...retake, cube: () => void act(retake.cube) }} />}
       {running && (
         <button type="button" class="danger" disabled={busy} onClick={() => void stop(job.id)} data-testid="cancel-job">
           {t("stop")}
@@ -108,7 +117,14 @@ function Start({ acquisition: { ready, files }, enough, onTheWay, busy, before, 
   );
 }
 
-function JobState({ job }: { job: Job }) {
+interface StateProps {
+  job: Job;
+  retake: { photos: () => void; cube: () => void };
+}
+
+const STAGE_TEXTS = { done: "stageDone", now: "stageNow", failed: "stageFailed", ahead: "stageAhead" } as const;
+
+function JobState({ job, retake }: StateProps) {
   const share = job.state === "succeeded" ? 1 : doneShare(job.stage, job.progress);
   return (
     <div data-testid="job-state" data-state={job.state}>
@@ -122,11 +138,11 @@ function JobState({ job }: { job: Job }) {
       <ol class="stages">
         {stagesOf(job).map(([stage, at]) => (
           <li class={at} data-testid="job-stage" data-stage={stage} data-at={at} aria-current={at === "now" ? "step" : undefined}>
-            {t(stage)} <span class="hidden">: {t(at === "done" ? "stageDone" : at === "now" ? "stageNow" : "stageAhead")}</span>
+            {t(stage)} <span class="hidden">: {t(STAGE_TEXTS[at])}</span>
           </li>
         ))}
       </ol>
-      {job.error && <Failure job={job} />}
+      {job.error && <Failure job={job} retake={retake} />}
       {job.cloud_id && (
         <a class="button primary big" href={href(["view", job.cloud_id])} data-testid="view-cloud">
           {t("view")}
@@ -136,8 +152,9 @@ function JobState({ job }: { job: Job }) {
   );
 }
 
-function Failure({ job: { error } }: { job: Job }) {
+function Failure({ job: { error }, retake }: StateProps) {
   if (!error) return null;
+  const remedy = remedyOf(error.code);
   const { reason, advice } = said(error.code, error.message, error.advice);
   return (
     <div class="box problem" role="alert" data-testid="job-failure">
@@ -146,6 +163,11 @@ function Failure({ job: { error } }: { job: Job }) {
       <p class="small">
         <code>{error.code}</code>
       </p>
+      {remedy && (
+        <button type="button" class="primary" onClick={retake[remedy]} data-testid={`retake-${remedy}`}>
+          {t(remedy === "photos" ? "retakePhotos" : "retakeCube")}
+        </button>
+      )}
     </div>
   );
 }

@@ -11,6 +11,7 @@ describe("a running job", () => {
 
   it("tells the stages", () => {
     expect(stagesOf({ state: "running", stage: "adjust" }).map(([, at]) => at)).toEqual(["done", "now", "ahead", "ahead"]);
+    expect(stagesOf({ state: "failed", stage: "register" }).map(([, at]) => at)).toEqual(["done", "done", "done", "failed"]);
     expect(stagesOf({ state: "queued", stage: null }).map(([, at]) => at)).toEqual(["ahead", "ahead", "ahead", "ahead"]);
     expect(stagesOf({ state: "succeeded", stage: "register" }).map(([, at]) => at)).toEqual(["done", "done", "done", "done"]);
   });

@@ -10,10 +10,11 @@ export function rounded(seconds: number): number {
   return Math.max(Math.ceil(seconds / grain) * grain, 5);
 }
 
-export type StageState = "done" | "now" | "ahead";
+export type StageState = "done" | "now" | "failed" | "ahead";
 
 /** What each stage of a job is at. */
 export function stagesOf(job: Pick<Job, "state" | "stage">): [Stage, StageState][] {
   const at = job.state === "succeeded" ? STAGES.length : job.stage === null ? -1 : STAGES.indexOf(job.stage);
-  return STAGES.map((stage, n) => [stage, n < at ? "done" : n === at ? "now" : "ahead"]);
+  const here = job.state === "failed" ? "failed" : "now";
+  return STAGES.map((stage, n) => [stage, n < at ? "done" : n === at ? here : "ahead"]);
 }

@@ -25,7 +25,7 @@ export function PhotoCard({ photo, markers, retake, remove }: Shown) {
   const words = said(judgement.code, judgement.reason, judgement.advice);
   return (
     <li class={`photo ${judgement.verdict}`} data-testid="photo-card" data-verdict={judgement.verdict} data-code={judgement.code ?? ""}>
-      <Picture id={photo.id} name={label} />
+      <Picture id={photo.id} name={photo.state === "refused" ? name : label} />
       <p class="verdict" data-testid="verdict" title={name}>
         <span aria-hidden="true">{SIGNS[judgement.verdict]}</span> {t(judgement.verdict)}
       </p>

@@ -1,4 +1,4 @@
-import { useRef, useState } from "preact/hooks";
+import { useEffect, useRef, useState } from "preact/hooks";
 import { asProblem, type Problem } from "../../api/problem";
 import { ProblemBox } from "../../ui/boxes";
 import { deleteFile } from "../acquisition-data";
@@ -16,19 +16,23 @@ interface Props {
   acquisition: string;
   photos: readonly Photo[];
   pending: readonly Item[];
+  camera: boolean;
+  setCamera: (open: boolean) => void;
   /** Where to stand for the next photo, in words. */
   next: string | null;
   refresh: () => void;
 }
 
-export function PhotoPanel({ acquisition, photos, pending, next, refresh }: Props) {
-  const [camera, setCamera] = useState(false);
+export function PhotoPanel({ acquisition, photos, pending, camera, setCamera, next, refresh }: Props) {
   const [replaced, setReplaced] = useState<Photo | null>(null);
   const [refused, setRefused] = useState<string[]>([]);
   const [problem, setProblem] = useState<Problem | null>(null);
   const picker = useRef<HTMLInputElement>(null);
   const top = useRef<HTMLElement>(null);
   const markers = markersOf(photos);
+  useEffect(() => {
+    if (camera) top.current?.scrollIntoView({ block: "start" });
+  }, [camera]);
 
   const send = async (photo: Blob, name: string): Promise<void> => {
     const replaces = replaced?.id ?? null;
@@ -59,6 +63,7 @@ export function PhotoPanel({ acquisition, photos, pending, next, refresh }: Prop
       if (!(await remove(photo))) return;
     } else setReplaced(photo);
     setCamera(true);
+    // The camera may be open already, and out of sight.
     top.current?.scrollIntoView({ block: "start" });
   };
   const hint = replaced && t("retaking", { name: replaced.label, advice: adviceOf(replaced) });
@@ -112,7 +117,7 @@ export function PhotoPanel({ acquisition, photos, pending, next, refresh }: Prop
       )}
       {problem && <ProblemBox problem={problem} />}
     </section>
-    <section class="all-photos" aria-label={t("photos")}>
+    <section class="all-photos" aria-label={t("taken")}>
       {photos.length + pending.length === 0 && <p class="small">{t("noPhotos")}</p>}
       <ul class="cards" aria-label={t("photos")} data-testid="photo-cards">
         {[...pending].reverse().map((item) => (
