@@ -29,6 +29,9 @@ const own = (): boolean => session.value?.cloud_id == null;
 
 /** Parts that are loaded when they are first opened. */
 const PANELS: LazyPanel[] = [
+  { name: "labels", load: () => import("./labels/label-panel"), allowed: () => own() && may("label") },
+  { name: "measure", load: () => import("./measure/measure-panel") },
+  { name: "share", load: () => import("./share/share-panel"), allowed: () => own() && may("upload") && may("read") },
   { name: "quality", load: () => import("./panels/quality-panel") },
 ];
 
@@ -108,5 +111,3 @@ function LazyFold({ panel, model, open = false }: { panel: LazyPanel; model: Vie
     </Fold>
   );
 }
-
-export const mayLabel = (): boolean => own() && may("label");

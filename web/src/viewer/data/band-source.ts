@@ -1,40 +1,14 @@
 /** Bands of all points: a coarse picture at once, from an even sample of spectra; the exact one when it has come. */
 import { fetched } from "../../api/client";
 import { readNpy } from "./npy";
+import { bandOfSample, sampleStep, type Sample } from "./sample";
 
-/** Values of a sample of spectra that are read at most; two thirds of what the service gives in one page. */
-const SAMPLE_VALUES = 12_000_000;
 const KEPT = 12;
 const NPY = { Accept: "application/x-npy" };
 
 export interface Band {
   values: Float32Array<ArrayBuffer>;
   exact: boolean;
-}
-
-export interface Sample {
-  /** Each `step`-th point is in the sample. */
-  step: number;
-  count: number;
-  /** Spectra, (count, bands). */
-  spectra: Float32Array;
-}
-
-/** Choose the step of an even sample: consecutive points are neighbours, so 16 of them are a row of a tile. */
-export function sampleStep(points: number, bands: number): number {
-  let step = 16;
-  while ((points / step) * bands > SAMPLE_VALUES || points / step > 100_000) step *= 2;
-  return step;
-}
-
-/** A band of all points, each with the value of its neighbour in the sample. */
-export function bandOfSample(sample: Sample, band: number, bands: number, points: number): Float32Array<ArrayBuffer> {
-  const out = new Float32Array(points);
-  for (let i = 0; i < sample.count; i++) {
-    const start = i * sample.step;
-    out.fill(sample.spectra[i * bands + band] ?? NaN, start, Math.min(start + sample.step, points));
-  }
-  return out;
 }
 
 export class BandSource {

@@ -1,6 +1,6 @@
 import { expect, it } from "vitest";
-import { bandOfSample, sampleStep } from "./band-source";
 import { readNpy, writeNpy } from "./npy";
+import { bandOfSample, sampleStep } from "./sample";
 
 it.each([Uint8Array.of(0, 1, 255), Uint16Array.of(0, 300, 65535)])("reads what it writes", (values) => {
   expect(readNpy(writeNpy(values).buffer)).toEqual({ shape: [3], values });

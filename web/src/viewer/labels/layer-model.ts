@@ -1,7 +1,8 @@
 /** The label layers that can be shown, and the one that is. */
 import { signal } from "@preact/signals";
 import { asProblem, type Problem } from "../../api/problem";
-import { classColours, listLayers, mostProbable, readLayer, type Label, type LabelClass } from "./label-layers";
+import { classColours, mostProbable, type LabelClass } from "./classes";
+import { listLayers, readLayer, type Label } from "./label-layers";
 
 export interface ShownLayer {
   name: string;

@@ -1,5 +1,5 @@
 import { expect, it } from "vitest";
-import { classColours, latin1, mostProbable } from "./label-layers";
+import { classColours, latin1, mostProbable } from "./classes";
 
 it("writes any name as a header that JSON reads back", () => {
   const text = JSON.stringify({ name: "però – 肿瘤 😀" });

@@ -1,0 +1,43 @@
+import { texts } from "../../i18n";
+
+const en = {
+  kind: "What to measure",
+  off: "Nothing",
+  line: "Distance along a line",
+  surface: "Distance along the surface",
+  angle: "Angle",
+  area: "Area of an outline",
+  hint: "Tap points one after the other.",
+  hintSurface: "Tap two points. The way follows the mesh’s edges, drawn straight; on known bodies it is within −1.5 and +9 %.",
+  hintAngle: "Tap three points: the angle is at the second.",
+  hintArea: "Tap three or more corners: the area of the flat outline through them.",
+  clear: "Begin again",
+  back: "Take back the last point",
+  mm: "{value} mm ± {sd}",
+  between: "{value} mm (at least {low}, at most {high})",
+  degrees: "{value}°",
+  square: "{value} mm²",
+  apart: "No surface joins these points.",
+  reading: "Reading the surface …",
+};
+const it: typeof en = {
+  kind: "Che cosa misurare",
+  off: "Nulla",
+  line: "Distanza lungo una linea",
+  surface: "Distanza lungo la superficie",
+  angle: "Angolo",
+  area: "Area di un contorno",
+  hint: "Tocca i punti uno dopo l’altro.",
+  hintSurface: "Tocca due punti. Il percorso segue gli spigoli della maglia, raddrizzato; su corpi noti è entro −1,5 e +9 %.",
+  hintAngle: "Tocca tre punti: l’angolo è nel secondo.",
+  hintArea: "Tocca tre o più vertici: l’area del contorno piano che li unisce.",
+  clear: "Ricomincia",
+  back: "Togli l’ultimo punto",
+  mm: "{value} mm ± {sd}",
+  between: "{value} mm (almeno {low}, al massimo {high})",
+  degrees: "{value}°",
+  square: "{value} mm²",
+  apart: "Nessuna superficie unisce questi punti.",
+  reading: "Lettura della superficie …",
+};
+export const t = texts({ en, it });
