@@ -12,8 +12,16 @@ export const sessionProblem = signal<Problem | null>(null);
 /** Whether a session ended while the page was in use: the sign-in page says so. */
 export const sessionLost = signal(false);
 
+const BEFORE = "specimap.signed-in";
+/** Whether somebody was signed in here before a reload; of this tab, and no more than that. */
+const before = {
+  get: () => tried(() => sessionStorage.getItem(BEFORE) !== null) ?? false,
+  set: (value: boolean) =>
+    tried(() => (value ? sessionStorage.setItem(BEFORE, "1") : sessionStorage.removeItem(BEFORE))),
+};
+
 onSignedOut(() => {
-  if (session.value) sessionLost.value = true;
+  if (session.value || before.get()) sessionLost.value = true;
   session.value = null;
 });
 
@@ -26,6 +34,7 @@ addEventListener("online", () => {
 export async function findSession(): Promise<void> {
   try {
     session.value = await body(api.GET("/v1/session"));
+    before.set(true);
     sessionProblem.value = null;
   } catch (thrown) {
     const problem = asProblem(thrown);
@@ -38,6 +47,7 @@ export async function findSession(): Promise<void> {
 export async function signIn(with_: { key: string } | { share: string }): Promise<Session> {
   const made = await body(api.POST("/v1/session", { body: with_ }));
   sessionLost.value = false;
+  before.set(true);
   session.value = made;
   return made;
 }
@@ -46,7 +56,17 @@ export async function signIn(with_: { key: string } | { share: string }): Promis
 export async function signOut(): Promise<void> {
   await api.DELETE("/v1/session").catch(() => undefined);
   sessionLost.value = false;
+  before.set(false);
   session.value = null;
+}
+
+function tried<T>(act: () => T): T | undefined {
+  try {
+    return act();
+  } catch {
+    // A browser that keeps nothing.
+    return undefined;
+  }
 }
 
 /** Whether the session's key has a scope; an administrator's has all. */
