@@ -149,6 +149,7 @@ function useStrokes(model: ViewerModel) {
 }
 
 function tapAt(model: ViewerModel, x: number, y: number, event: PointerEvent | KeyboardEvent): void {
+  if (model.tapFirst?.(x, y)) return;
   const index = model.pointAt(x, y);
   if (index === null) return;
   const { tap } = model.tool.value ?? {};

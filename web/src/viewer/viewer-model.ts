@@ -1,7 +1,7 @@
 /** What the parts of the viewer share: the cloud, the state of the view, and what follows from it. */
 import { effect, signal, untracked } from "@preact/signals";
 import type { Schemas } from "../api/client";
-import { asProblem } from "../api/problem";
+import { asProblem, type Problem } from "../api/problem";
 import { setQuery } from "../app/route";
 import { Colouring } from "./colour/colouring";
 import { rgbOf } from "./colour/colour-maps";
@@ -11,10 +11,11 @@ import { CloudLoader } from "./data/cloud-loader";
 import type { PointCloud } from "./data/point-cloud";
 import { LayerModel } from "./labels/layer-model";
 import type { CloudView } from "./render/cloud-view";
+import type { MeshView } from "./render/mesh-view";
 import { pick, type Plane } from "./render/projection";
 import { SpectraStore } from "./spectra/spectra-store";
 import { t } from "./texts";
-import { decode, encode, firstState, type Section, type ViewState } from "./view-state";
+import { decode, encode, firstState, type Section, type Shape, type ViewState } from "./view-state";
 
 export type CloudInfo = Schemas["Cloud"];
 /** What a tap or a stroke on the picture does. A part of the page that is loaded later brings its own. */
@@ -48,6 +49,11 @@ export class ViewerModel {
   readonly keep = signal(false);
   /** Whether the spectra of the link have been read: until then they stay in the address. */
   private readonly restored = signal(false);
+  /** Takes a tap before the cloud does; true where it was for it. */
+  tapFirst: ((x: number, y: number) => boolean) | null = null;
+  /** Why the surface cannot be shown. */
+  readonly meshProblem = signal<Problem | null>(null);
+  private mesh: MeshView | null = null;
   private readonly ends: (() => void)[] = [];
   private urlTimer: ReturnType<typeof setTimeout> | undefined;
   private ahead: ReturnType<typeof setTimeout> | undefined;
@@ -93,7 +99,11 @@ export class ViewerModel {
         if (this.loader.state.value === "ready") untracked(() => this.readAhead());
       }),
       effect(() => view.setPointScale(this.state.value.size)),
-      effect(() => view.showPoints(this.state.value.shape !== "mesh")),
+      effect(() => {
+        const { shape } = this.state.value;
+        // A nearest point is looked for when all are there.
+        if (this.loader.state.value === "ready") void untracked(() => this.showShape(view, shape));
+      }),
       effect(() => this.showRings(view)),
       effect(() => this.writeUrl()),
       effect(() => {
@@ -187,6 +197,23 @@ export class ViewerModel {
     if (cursor !== null) rings.push({ place: cloud.place(cursor), rgb: [255, 255, 255] });
     // Positions that come later move the rings.
     if (this.loader.state.value !== "loading") view.setRings(rings);
+  }
+
+  private async showShape(view: CloudView, shape: Shape): Promise<void> {
+    this.meshProblem.value = null;
+    try {
+      if (shape !== "cloud" && !this.mesh) {
+        const [{ MeshView: Made }, { surfaceOf }] = await Promise.all([import("./render/mesh-view"), import("./measure/surface-source")]);
+        const surface = await surfaceOf(this.info.id);
+        if (this.view.peek() !== view) return;
+        this.mesh ??= new Made(view, surface);
+      }
+      const now = this.state.peek().shape;
+      this.mesh?.show(now !== "cloud");
+      view.showPoints(now !== "mesh");
+    } catch (thrown) {
+      this.meshProblem.value = asProblem(thrown);
+    }
   }
 
   private async restoreSpectra(chosen: readonly number[]): Promise<void> {

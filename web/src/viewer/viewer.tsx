@@ -31,6 +31,9 @@ const own = (): boolean => session.value?.cloud_id == null;
 const PANELS: LazyPanel[] = [
   { name: "labels", load: () => import("./labels/label-panel"), allowed: () => own() && may("label") },
   { name: "measure", load: () => import("./measure/measure-panel") },
+  { name: "cameras", load: () => import("./cameras/camera-panel") },
+  { name: "top", load: () => import("./top/top-panel") },
+  { name: "figure", load: () => import("./figure/figure-panel") },
   { name: "share", load: () => import("./share/share-panel"), allowed: () => own() && may("upload") && may("read") },
   { name: "quality", load: () => import("./panels/quality-panel") },
 ];

@@ -1,7 +1,9 @@
 /** From where, and how large, the points are seen. */
+import { ProblemBox } from "../../ui/boxes";
 import { t } from "../texts";
 import type { PanelProps } from "../viewer";
-import { Slider } from "./fields";
+import { SHAPES } from "../view-state";
+import { Choice, Slider } from "./fields";
 
 const SIDES = [
   ["fromAll", [0, -0.55, 1]],
@@ -11,7 +13,8 @@ const SIDES = [
 ] as const;
 
 export function ViewPanel({ model }: PanelProps) {
-  const { size } = model.state.value;
+  const { size, shape } = model.state.value;
+  const problem = model.meshProblem.value;
   const look = (from: readonly [number, number, number]): void => {
     const view = model.view.value;
     view?.home(from);
@@ -26,6 +29,14 @@ export function ViewPanel({ model }: PanelProps) {
           </button>
         ))}
       </div>
+      <Choice
+        label={t("shape")}
+        testid="shape"
+        value={shape}
+        options={SHAPES.map((name) => [name, t(name)] as const)}
+        onChange={(name) => model.patch({ shape: name })}
+      />
+      {problem && <ProblemBox problem={problem} again={() => model.patch({})} />}
       <Slider
         label={t("pointSize")}
         testid="point-size"

@@ -12,8 +12,10 @@ import {
   Vector3,
   WebGLRenderer,
   type Object3D,
+  type WebGLRenderTarget,
 } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
+import type { Tile } from "../figure/figure-layout";
 import { CHUNK, NOWHERE, type PointCloud } from "../data/point-cloud";
 import { levelOrder } from "../data/shard-plan";
 import { DrawBudget } from "./draw-budget";
@@ -39,6 +41,9 @@ export class CloudView {
   readonly colours: Uint8Array<ArrayBuffer>;
   /** Called after the camera has come to rest. */
   onRest: () => void = () => undefined;
+  /** Called when colours have been written, and when the section has changed: what else is drawn follows. */
+  onRecolour: () => void = () => undefined;
+  onSection: () => void = () => undefined;
   /** Called with each frame drawn. */
   onFrame: () => void = () => undefined;
   private readonly scene = new Scene();
@@ -112,6 +117,7 @@ export class CloudView {
   recolour(): void {
     attribute(this.points, "colour").needsUpdate = true;
     if (this.coarse.visible) this.colourCoarse();
+    this.onRecolour();
     this.draw();
   }
 
@@ -129,6 +135,7 @@ export class CloudView {
   setSection(plane: Plane | null): void {
     this.section = plane;
     for (const material of [this.material, this.coarseMaterial]) material.uniforms.plane.value.fromArray(plane ?? [0, 0, 0, 1]);
+    this.onSection();
     this.draw();
   }
 
@@ -209,11 +216,39 @@ export class CloudView {
     if (this.frame === 0) this.frame = requestAnimationFrame((now) => this.drawNow(now));
   }
 
-  /** Draw all points at once, for a picture of this state. `perMm` of a larger picture's tiles may differ. */
-  drawAll(perMm = pixelsPerMm(this.projection()) * this.renderer.getPixelRatio()): void {
+  /**
+   * Draw a picture of another size, a tile at a time; `take` gets the pixels of each, four bytes each, rows from below.
+   */
+  drawTiles(
+    background: string,
+    width: number,
+    height: number,
+    tiles: readonly Tile[],
+    take: (tile: Tile, pixels: Uint8Array) => void,
+    target: (width: number, height: number) => WebGLRenderTarget,
+  ): void {
+    const shown = this.scene.background;
+    this.scene.background = new Color().setStyle(background, LinearSRGBColorSpace);
     this.placeCamera();
-    this.drawPoints(this.cloud.points, perMm);
-    this.renderer.render(this.scene, this.camera);
+    const perMm = (pixelsPerMm(this.projection()) * height) / this.canvas.clientHeight;
+    try {
+      for (const tile of tiles) {
+        const into = target(tile.width, tile.height);
+        this.camera.setViewOffset(width, height, tile.x, tile.y, tile.width, tile.height);
+        this.drawPoints(this.cloud.points, perMm);
+        this.renderer.setRenderTarget(into);
+        this.renderer.render(this.scene, this.camera);
+        const pixels = new Uint8Array(tile.width * tile.height * 4);
+        this.renderer.readRenderTargetPixels(into, 0, 0, tile.width, tile.height, pixels);
+        into.dispose();
+        take(tile, pixels);
+      }
+    } finally {
+      this.renderer.setRenderTarget(null);
+      this.camera.clearViewOffset();
+      this.scene.background = shown;
+      this.draw();
+    }
   }
 
   private drawNow(now: number): void {
