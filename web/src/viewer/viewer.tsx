@@ -43,6 +43,7 @@ export function Viewer({ model, fallback }: { model: ViewerModel; fallback: Comp
   if (broken) return <>{fallback}</>;
   return (
     <div class="viewer">
+      <h1 class="unseen">{t("picture")}</h1>
       <div class="stage">
         <Canvas model={model} onBroken={() => setBroken(true)} />
         <OutlineOverlay />

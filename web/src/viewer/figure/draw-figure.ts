@@ -103,7 +103,9 @@ function drawColourBar(context: CanvasRenderingContext2D, model: ViewerModel, un
     context.fillRect(x + w, place - unit / 2, 6 * unit, unit);
     context.fillText(String(at), x + w + 10 * unit, place + 6 * unit);
   }
-  const what = mode === "band" ? bandName(model, band) : mode === "ratio" || mode === "difference" ? `${bandName(model, pair[0])} / ${bandName(model, pair[1])}` : t(mode);
+  const [a, b] = pair.map((of) => bandName(model, of));
+  const names: Partial<Record<string, string>> = { band: bandName(model, band), ratio: `${a} / ${b}`, difference: `(${a} − ${b}) / (${a} + ${b})` };
+  const what = names[mode] ?? t(mode);
   context.textAlign = "right";
   context.fillText([what, unitOf(mode, model.info.quantity)].filter(Boolean).join(", "), width - 20 * unit, 36 * unit);
 }

@@ -83,6 +83,7 @@ export class CloudView {
     this.points = this.fullPoints();
     this.coarse = this.coarsePoints();
     for (const object of [this.points, this.coarse, this.rings]) object.frustumCulled = false;
+    this.coarse.visible = !cloud.complete;
     this.rings.renderOrder = 10;
     this.scene.add(this.points, this.coarse, this.extras, this.rings);
     this.watch = new ResizeObserver(() => this.resize());
@@ -231,6 +232,9 @@ export class CloudView {
     this.scene.background = new Color().setStyle(background, LinearSRGBColorSpace);
     this.placeCamera();
     const perMm = (pixelsPerMm(this.projection()) * height) / this.canvas.clientHeight;
+    const diameter = this.ringMaterial.uniforms.diameter as { value: number };
+    const own = diameter.value;
+    diameter.value = (own * height) / this.canvas.height;
     try {
       for (const tile of tiles) {
         const into = target(tile.width, tile.height);
@@ -244,6 +248,7 @@ export class CloudView {
         take(tile, pixels);
       }
     } finally {
+      diameter.value = own;
       this.renderer.setRenderTarget(null);
       this.camera.clearViewOffset();
       this.scene.background = shown;
@@ -328,6 +333,7 @@ export class CloudView {
     const chunks = boxes.length / 6;
     const centres = Float32Array.from({ length: chunks * 3 }, (_, i) => {
       const at = Math.floor(i / 3) * 6 + (i % 3);
+      if (this.cloud.known[Math.floor(i / 3)]) return NOWHERE;
       return ((boxes[at] ?? 0) + (boxes[at + 3] ?? 0)) / 2;
     });
     const geometry = new BufferGeometry();
