@@ -21,7 +21,7 @@ export class DrawBudget {
   /** Take the time that the last frame of a motion took, ms. */
   took(ms: number): void {
     // One slow frame may be the machine's; a frame quicker than the aim lets the share grow slowly.
-    if (ms > AIM_MS * 1.25) this.share = Math.max(FEWEST / this.points, this.share * Math.max(0.5, AIM_MS / ms));
+    if (ms > AIM_MS * 1.25) this.share = Math.max(FEWEST / this.points, this.share * Math.max(0.1, AIM_MS / ms));
     else if (ms < AIM_MS * 0.75) this.share = Math.min(1, this.share * 1.15);
   }
 }
