@@ -34,7 +34,10 @@ ARGUMENTS = (
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist",
+    "--host-resolver-rules=MAP specimap.test 127.0.0.1",
 )
+PLAIN_HOST = "specimap.test"
+"""This machine under a name that is no secure context on plain HTTP, unlike 127.0.0.1: much is missing there."""
 TABLET = {"width": 1180, "height": 820}
 SERIOUS = ("serious", "critical")
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, Route, expect
 
-from tests.support.browser_scene import Window
+from tests.support.browser_scene import PLAIN_HOST, Window
 from tests.support.places import SAMPLES
 from tests.support.service_scene import Running
 from tests.support.upload_scene import photos
@@ -102,6 +102,18 @@ def test_a_reload_loses_nothing(service: Running, window: Window) -> None:
     expect_judged(page, 2)
     names = page.get_by_test_id("photo-card").locator("img")
     expect(names).to_have_count(2)
+
+
+def test_photos_are_sent_from_an_address_without_tls(service: Running, window: Window) -> None:
+    page, url = window.page, service.url.replace("127.0.0.1", PLAIN_HOST)
+    window.sign_in(url, service.key())
+    assert page.evaluate("isSecureContext") is False
+    page.goto(f"{url}/#/capture")
+    create(page, "SP-3")
+    page.get_by_test_id("open-camera").click()
+    expect(page.get_by_test_id("camera-trouble")).to_contain_text("https")
+    pick(page, *photos()[:2])
+    expect_judged(page, 2)
 
 
 def test_a_lost_session_loses_nothing(service: Running, window: Window) -> None:

@@ -7,6 +7,7 @@ import { ProblemBox } from "../ui/boxes";
 import { fieldText } from "../ui/form";
 import { PagedTable } from "../ui/paged";
 import { t } from "./texts";
+import { copyText } from "../ui/browser";
 
 const SCOPES = ["upload", "read", "label", "intraoperative", "admin"] as const;
 type KeyRequest = Schemas["KeyRequest"];
@@ -68,7 +69,7 @@ function NewKeyBox({ made }: { made: Schemas["NewKey"] }) {
       <p>{t("shown")}</p>
       <p>
         <code data-testid="new-key">{made.key}</code>{" "}
-        <button type="button" onClick={() => void navigator.clipboard.writeText(made.key).then(() => setCopied(true))}>
+        <button type="button" onClick={() => void copyText(made.key).then(setCopied)}>
           {copied ? t("copied") : t("copy")}
         </button>
       </p>

@@ -7,6 +7,7 @@ import { ProblemBox } from "../ui/boxes";
 import { Barcode } from "./barcode";
 import { PATTERN } from "./specimen-id";
 import { t } from "./texts";
+import { randomId } from "../ui/browser";
 
 type Request = Schemas["AcquisitionRequest"];
 type Dictionary = NonNullable<Request["dictionary"]>;
@@ -39,7 +40,7 @@ export function NewAcquisition() {
   const [problem, setProblem] = useState<Problem | null>(null);
   const [busy, setBusy] = useState(false);
   // The same press again, after a lost answer, makes no second acquisition.
-  const [token, setToken] = useState(() => crypto.randomUUID());
+  const [token, setToken] = useState(() => randomId());
 
   const submit = async (event: SubmitEvent): Promise<void> => {
     event.preventDefault();
@@ -64,7 +65,7 @@ export function NewAcquisition() {
       go(["capture", made.id]);
     } catch (thrown) {
       const refused = asProblem(thrown);
-      if (refused.status !== 0 && refused.status < 500) setToken(crypto.randomUUID());
+      if (refused.status !== 0 && refused.status < 500) setToken(randomId());
       setProblem(refused);
     } finally {
       setBusy(false);

@@ -13,6 +13,7 @@ import { t } from "../texts";
 import { isFinal, useJobs } from "./follow";
 import { remedyOf } from "./remedy";
 import { rounded, stagesOf, type Job } from "./time-left";
+import { randomId } from "../../ui/browser";
 
 /** Photos without which the service runs no job. */
 const LEAST = 6;
@@ -30,7 +31,7 @@ export function JobPanel({ acquisition, enough, onTheWay, retake }: Props) {
   const [urgent, setUrgent] = useState(true);
   const [problem, setProblem] = useState<Problem | null>(null);
   const [busy, setBusy] = useState(false);
-  const [token, setToken] = useState(() => crypto.randomUUID());
+  const [token, setToken] = useState(() => randomId());
   const job = jobs.data?.[0];
 
   const act = async (work: () => Promise<unknown>): Promise<void> => {
@@ -38,11 +39,11 @@ export function JobPanel({ acquisition, enough, onTheWay, retake }: Props) {
     try {
       await work();
       setProblem(null);
-      setToken(crypto.randomUUID());
+      setToken(randomId());
       jobs.again();
     } catch (thrown) {
       const refused = asProblem(thrown);
-      if (refused.status !== 0 && refused.status < 500) setToken(crypto.randomUUID());
+      if (refused.status !== 0 && refused.status < 500) setToken(randomId());
       setProblem(refused);
     } finally {
       setBusy(false);

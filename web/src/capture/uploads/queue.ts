@@ -6,6 +6,7 @@ import type { File as StoredFile } from "../photos/checks";
 import { due, isSame, meaningOf, nextDue, step, type Event, type Item, type Role, type Trouble } from "./item";
 import { send, type Sending } from "./send";
 import * as storage from "./storage";
+import { randomId } from "../../ui/browser";
 
 /** All files on their way, of all acquisitions. */
 export const items = signal<readonly Item[]>([]);
@@ -44,7 +45,7 @@ export interface Addition {
 /** Add a file: it is kept first, then sent. */
 export async function add({ acquisition, role, file, name, replaces = null }: Addition): Promise<Item> {
   const item: Item = {
-    id: crypto.randomUUID(),
+    id: randomId(),
     acquisition,
     role,
     name,

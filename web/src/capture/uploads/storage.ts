@@ -41,13 +41,15 @@ async function within<T>(
 /** Whether a file of this size fits into what the browser keeps. */
 export async function fits(size: number): Promise<boolean> {
   if (size > LARGEST_KEPT) return false;
+  // On plain HTTP browsers do not say how much there is room for.
+  if (!("storage" in navigator)) return true;
   const { quota, usage } = await navigator.storage.estimate().catch(() => ({ quota: undefined, usage: undefined }));
   return quota === undefined || size < LARGEST_SHARE * (quota - (usage ?? 0));
 }
 
 /** Ask the browser not to clear what is kept when its disk runs short. */
 export async function keepForGood(): Promise<void> {
-  await navigator.storage.persist().catch(() => false);
+  if ("storage" in navigator) await navigator.storage.persist().catch(() => false);
 }
 
 /** Keep an item, and its bytes with it where they are given. Rejects where the browser keeps nothing. */

@@ -9,6 +9,7 @@ import { ProblemBox } from "../../ui/boxes";
 import { fieldText } from "../../ui/form";
 import type { PanelProps } from "../viewer";
 import { encode } from "../view-state";
+import { copyText, randomId } from "../../ui/browser";
 
 type Share = Schemas["Share"];
 
@@ -69,7 +70,7 @@ export default function SharePanel({ model }: PanelProps) {
     try {
       const made = await body(
         api.POST("/v1/clouds/{cloud_id}/shares", {
-          params: { path: { cloud_id }, header: { "idempotency-key": crypto.randomUUID() } },
+          params: { path: { cloud_id }, header: { "idempotency-key": randomId() } },
           // A minute less: the service counts the days by its own clock.
           body: { name: fieldText(form, "name"), expires_at: new Date(Date.now() + days * DAY_MS - 60_000).toISOString() },
         }),
@@ -125,7 +126,7 @@ function NewLink({ link }: { link: string }) {
     <div class="box" role="status">
       <label for={id}>{t("link")}</label>
       <input id={id} type="text" readOnly value={link} data-testid="share-link" onFocus={(event) => event.currentTarget.select()} />
-      <button type="button" onClick={() => void navigator.clipboard.writeText(link).then(() => setCopied(true))}>
+      <button type="button" onClick={() => void copyText(link).then(setCopied)}>
         {copied ? t("copied") : t("copy")}
       </button>
     </div>
