@@ -61,7 +61,7 @@ export class CloudView {
   private askedAt = 0;
   private drawMs = 0;
   private wasMoving = false;
-  private movedAt = 0;
+  private moving = false;
   private rest: ReturnType<typeof setTimeout> | undefined;
   private handMoved = false;
   private section: Plane | null = null;
@@ -264,7 +264,7 @@ export class CloudView {
   private drawNow(now: number): void {
     this.frame = 0;
     // While points are read, each part of them is a frame.
-    const moving = now - this.movedAt < REST_MS || !this.cloud.complete;
+    const moving = this.moving || !this.cloud.complete;
     const began = performance.now();
     // A GPU that is behind holds back either the frame or the calls that draw it.
     if (moving && this.wasMoving) this.budget.took(Math.max(began - this.askedAt, this.drawMs));
@@ -275,6 +275,7 @@ export class CloudView {
     this.drawPoints(moving ? this.budget.moving : this.cloud.points, pixelsPerMm(this.projection()) * this.renderer.getPixelRatio());
     this.renderer.render(this.scene, this.camera);
     this.drawMs = performance.now() - began;
+    if (this.moving) this.awaitRest();
     this.onFrame();
   }
 
@@ -297,14 +298,20 @@ export class CloudView {
 
   /** Draw what the machine can in a frame, and all when nothing has come for a while. */
   private drawCoarsely(): void {
-    this.movedAt = performance.now();
+    this.moving = true;
+    clearTimeout(this.rest);
     this.draw();
+  }
+
+  /** Called after a frame, not after the move that it shows: a slow frame must not look like rest. */
+  private awaitRest(): void {
     clearTimeout(this.rest);
     this.rest = setTimeout(() => {
+      this.moving = false;
       this.draw();
       if (this.handMoved) this.onRest();
       this.handMoved = false;
-    }, REST_MS + 20);
+    }, REST_MS);
   }
 
   /** The nearest and farthest that is drawn hug the cloud: depth is as fine as it can be. */
