@@ -28,9 +28,8 @@ ARGUMENTS = (
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
-    # A camera that shows a test picture, for pages that may use one.
+    # The camera needs no permission.
     "--use-fake-ui-for-media-stream",
-    "--use-fake-device-for-media-stream",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist",

@@ -6,6 +6,8 @@ import json
 import re
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from playwright.sync_api import Page, Route, expect
 
@@ -100,8 +102,7 @@ def test_a_reload_loses_nothing(service: Running, window: Window) -> None:
     page.unroute("**/v1/uploads/*", hold)
     page.reload()
     expect_judged(page, 2)
-    names = page.get_by_test_id("photo-card").locator("img")
-    expect(names).to_have_count(2)
+    expect(page.get_by_test_id("photo-card").locator("img")).to_have_count(2)
 
 
 def test_photos_are_sent_from_an_address_without_tls(service: Running, window: Window) -> None:
@@ -188,6 +189,25 @@ def test_one_tap_takes_a_refused_photo_again(service: Running, window: Window, t
     usable = re.compile("accepted|doubtful")
     expect(page.get_by_test_id("photo-card")).to_have_attribute("data-verdict", usable, timeout=JUDGED_MS)
     expect(page.get_by_test_id("last-verdict")).to_contain_text(re.compile("good|better again"))
+
+
+def test_a_better_photo_takes_the_place_of_a_doubtful_one(service: Running, window: Window, tmp_path: Path) -> None:
+    page = window.page
+    acquisition = begin(window, service)
+    dark = np.asarray(cv2.imread(str(photos()[0])), np.uint8) // 8
+    assert cv2.imwrite(str(tmp_path / "dark.jpg"), dark)
+    pick(page, tmp_path / "dark.jpg")
+    expect(page.get_by_test_id("photo-card")).to_have_attribute("data-code", "photo_underexposed", timeout=JUDGED_MS)
+    page.get_by_test_id("retake").click()
+    # It stays until the better one is there.
+    expect(page.get_by_test_id("shutter")).to_be_enabled()
+    expect(page.get_by_test_id("photo-card")).to_have_attribute("data-verdict", "doubtful")
+    with page.expect_response(lambda answer: "/result" in answer.url) as judged:
+        page.get_by_test_id("shutter").click()
+    # A frame may be caught between two photos of the sample: then both stay.
+    better = judged.value.json()["file"]["judgement"]["verdict"] == "accepted"
+    expect(page.get_by_test_id("photo-card")).to_have_count(1 if better else 2, timeout=JUDGED_MS)
+    assert len(service.client().get(f"/v1/acquisitions/{acquisition}/files").json()) == (1 if better else 2)
 
 
 @pytest.mark.parametrize(("name", "said"), [("NotAllowedError", "blocked"), ("NotFoundError", "no camera")])

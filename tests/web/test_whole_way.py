@@ -31,9 +31,7 @@ def new_acquisition(page: Page, specimen: str) -> None:
     expect(page.get_by_test_id("capture")).to_be_visible()
 
 
-def test_specimen_is_captured_in_spite_of_the_network_and_becomes_a_cloud(
-    served: Served, window: Window
-) -> None:
+def test_specimen_is_captured_in_spite_of_the_network_and_becomes_a_cloud(served: Served, window: Window) -> None:
     url, key, page = served.printed("Specimap listens on "), "spk_" + served.printed("spk_"), window.page
     window.sign_in(url, key)
     new_acquisition(page, "S-2026-7")

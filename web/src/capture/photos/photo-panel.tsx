@@ -44,7 +44,10 @@ export function PhotoPanel({ acquisition, photos, pending, camera, setCamera, ne
     const strange = files.filter((file) => !maybePhoto(file)).map(({ name }) => t("noPhotoFile", { name }));
     const empty = files.filter(({ size }) => size === 0).map(({ name }) => t("emptyFile", { name }));
     setRefused([...strange, ...empty]);
-    for (const file of giveBack(acquisition, files.filter((one) => one.size > 0 && maybePhoto(one)))) await send(file, file.name);
+    const fresh = giveBack(acquisition, files.filter((one) => one.size > 0 && maybePhoto(one)));
+    // All are on their way at once; their pictures are drawn one after the other, each takes the memory of a whole photo.
+    const items = await Promise.all(fresh.map((file) => add({ acquisition, role: "photo", file, name: file.name })));
+    for (const [n, item] of items.entries()) await drawPicture(item.id, fresh[n] ?? new Blob());
   };
   const remove = async (photo: Photo): Promise<boolean> => {
     try {

@@ -1,14 +1,18 @@
 /** Small pictures of photos, made here: the service keeps originals only. */
 import { signal } from "@preact/signals";
-import { keepPicture, pictureOf } from "../uploads/storage";
+import { bytesOf, keepPicture, pictureOf } from "../uploads/storage";
 
 const WIDTH = 320;
 
 /** Addresses of pictures by the id of an item or of a file; null where there is none. */
 const addresses = signal<ReadonlyMap<string, string | null>>(new Map());
 
+/** Files of the service by the items that they were: a photo may be judged before its picture is drawn. */
+const became = new Map<string, string>();
+
 function show(id: string, picture: Blob | undefined): void {
-  addresses.value = new Map(addresses.value).set(id, picture ? URL.createObjectURL(picture) : null);
+  const address = picture ? URL.createObjectURL(picture) : null;
+  addresses.value = new Map(addresses.value).set(id, address).set(became.get(id) ?? id, address);
 }
 
 /** Make and keep the picture of a photo; without one where the browser cannot decode it (HEIC outside Safari). */
@@ -28,11 +32,12 @@ export async function drawPicture(id: string, photo: Blob): Promise<void> {
     picture = undefined;
   }
   show(id, picture);
-  if (picture) await keepPicture(id, picture).catch(() => undefined);
+  if (picture) await keepPicture(became.get(id) ?? id, picture).catch(() => undefined);
 }
 
 /** Let the file of the service have the picture of the item that it was. */
 export function handOver(from: string, to: string): void {
+  became.set(from, to);
   const address = addresses.value.get(from);
   if (address !== undefined) addresses.value = new Map(addresses.value).set(to, address);
   void pictureOf(from)
@@ -43,11 +48,21 @@ export function handOver(from: string, to: string): void {
 /** The address of a picture; it is looked up when first asked for. */
 export function pictureAddress(id: string): string | null {
   const known = addresses.value.get(id);
-  if (known === undefined) {
-    void pictureOf(id).then(
-      (picture) => show(id, picture),
-      () => show(id, undefined),
-    );
-  }
+  if (known === undefined) void lookUp(id);
   return known ?? null;
+}
+
+const sought = new Set<string>();
+
+async function lookUp(id: string): Promise<void> {
+  if (sought.has(id)) return;
+  sought.add(id);
+  const picture = await pictureOf(id).catch(() => undefined);
+  if (picture) {
+    show(id, picture);
+    return;
+  }
+  // The page was left before it was drawn; the photo itself is there until the service has it.
+  const photo = await bytesOf(id).catch(() => undefined);
+  if (photo) await drawPicture(id, photo);
 }

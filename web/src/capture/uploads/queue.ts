@@ -60,12 +60,13 @@ export async function add({ acquisition, role, file, name, replaces = null }: Ad
     trouble: null,
   };
   held.set(item.id, file);
-  items.value = [...items.value, item];
   try {
     await storage.keep(item, (await storage.fits(file.size)) ? file : undefined);
   } catch {
     forgetful.value = true;
   }
+  // Shown only now: what is seen on the page outlives a reload.
+  items.value = [...items.value, item];
   pump();
   return item;
 }

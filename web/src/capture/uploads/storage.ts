@@ -7,6 +7,7 @@ const BYTES = "bytes";
 const PICTURES = "pictures";
 /** A file that takes more than this share of the browser's free room stays where it is. */
 const LARGEST_SHARE = 0.4;
+const SURELY_KEPT = 4_000_000;
 const LARGEST_KEPT = 1_500_000_000;
 
 let opened: Promise<IDBDatabase> | null = null;
@@ -41,6 +42,8 @@ async function within<T>(
 /** Whether a file of this size fits into what the browser keeps. */
 export async function fits(size: number): Promise<boolean> {
   if (size > LARGEST_KEPT) return false;
+  // Asking how much room there is takes longer than keeping a photo.
+  if (size < SURELY_KEPT) return true;
   // On plain HTTP browsers do not say how much there is room for.
   if (!("storage" in navigator)) return true;
   const { quota, usage } = await navigator.storage.estimate().catch(() => ({ quota: undefined, usage: undefined }));
