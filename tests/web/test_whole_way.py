@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
+import specimap_client as sc
 from tests.support.browser_scene import Window
 from tests.support.places import SAMPLES
 from tests.support.scenes import OnDisk
 from tests.support.serve_scene import Served, running
 
+COLUMNS = 464
+"""Of the sample's cube."""
 pytestmark = [pytest.mark.slow, pytest.mark.waits]
 
 
@@ -62,6 +67,28 @@ def test_specimen_is_captured_in_spite_of_the_network_and_becomes_a_cloud(served
     expect(page.get_by_test_id("job-state")).to_have_attribute("data-state", "succeeded", timeout=180_000)
     page.get_by_test_id("view-cloud").click()
     expect(page).to_have_url(re.compile("#/view/cloud_"))
+    canvas = page.get_by_test_id("viewer-canvas")
+    expect(canvas).to_have_attribute("data-state", "ready", timeout=60_000)
+    assert int(canvas.get_attribute("data-points") or 0) > 100_000
+    assert window.faults() == []
+    with sc.Client(url, key) as client:
+        (cloud,) = client.clouds.list()
+        top = int(np.argmax(np.where(cloud.flags & 1, cloud.xyz[:, 2], -np.inf)))
+        at = page.evaluate(f"window.specimapViewer.project({top})")
+        page.mouse.click(at["x"], at["y"])
+        expect(page.get_by_test_id("spectrum-plot")).to_be_visible()
+        row, column = (int(n) for n in re.findall(r"\d+", page.get_by_test_id("point-details").inner_text())[-2:])
+        (index,) = np.flatnonzero((cloud.hsi_pixel == [row, column]).all(1))
+        assert np.linalg.norm(cloud.xyz[index] - cloud.xyz[top]) < 1.5
+        with page.expect_download() as download:
+            page.get_by_test_id("spectra-csv").click()
+        lines = list(csv.reader(download.value.path().read_text("utf-8-sig").splitlines()))[1:]
+        shown = [float(line[2]) for line in lines]
+        # What the browser shows is what the uploaded file holds.
+        values = np.fromfile(data, "<u2").reshape(cloud.bands, -1, COLUMNS)[:, row, column]
+        np.testing.assert_allclose(shown, values * 1e-4, atol=1.01e-4)
+    page.get_by_test_id("spectrum-plot").scroll_into_view_if_needed()
+    window.picture("web-viewer")
 
 
 def test_photos_are_taken_with_the_camera_of_the_tablet(served: Served, window: Window) -> None:

@@ -96,13 +96,15 @@ function LazyFold({ panel, model, open = false }: { panel: LazyPanel; model: Vie
   const [loaded, setLoaded] = useState<{ show: Panel } | null>(null);
   const [problem, setProblem] = useState<Problem | null>(null);
   const { load } = panel;
+  // The picture comes first.
+  const waits = model.loader.state.value === "loading";
   useEffect(() => {
-    if (!wanted || loaded || problem) return;
+    if (!wanted || waits || loaded || problem) return;
     load().then(
       (module) => setLoaded({ show: module.default }),
       (thrown: unknown) => setProblem(asProblem(thrown)),
     );
-  }, [wanted, loaded, problem, load]);
+  }, [wanted, waits, loaded, problem, load]);
   return (
     <Fold name={panel.name} open={open} onOpen={() => setWanted(true)}>
       {problem ? (
