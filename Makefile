@@ -55,8 +55,8 @@ $(STAMP): pyproject.toml client/pyproject.toml requirements.lock | $(RUN)/python
 
 $(WEB_PACKAGES): web/package.json web/package-lock.json web/.npmrc $(STAMP)
 	@echo "Installing the packages of the web pages into web/node_modules"
-	@$(NPM) ci --silent || { \
-		echo "The packages of the web pages could not be fetched from $$($(NPM) config get registry). To name a mirror: make setup npm_config_registry=https://..." >&2; exit 1; }
+	@$(NPM) ci --loglevel error || { \
+		echo "The packages of the web pages could not be installed from $$($(NPM) config get registry). To name a mirror: npm_config_registry=https://... make setup" >&2; exit 1; }
 	@touch $@
 
 $(PAGES): $(PAGE_SOURCES) openapi.yaml $(WEB_PACKAGES)
