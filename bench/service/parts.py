@@ -11,6 +11,7 @@ from bench.service.clouds import bench_cloud, sheet_cloud
 from bench.service.jobs import bench_jobs, sheet_jobs
 from bench.service.neighbour import bench_neighbour, sheet_neighbour
 from bench.service.options import Options
+from bench.service.pages import bench_pages, sheet_pages
 from bench.service.scale import bench_scale
 from bench.service.scale_sheets import sheet_scale
 from bench.service.shard import bench_shard, sheet_shard
@@ -27,6 +28,7 @@ PARTS: dict[str, tuple[Callable[[Path, Options], Figures], Callable[[Figures], l
     "jobs": (bench_jobs, sheet_jobs),
     "neighbour": (bench_neighbour, sheet_neighbour),
     "scale": (bench_scale, sheet_scale),
+    "pages": (bench_pages, sheet_pages),
 }
 
 

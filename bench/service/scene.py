@@ -23,6 +23,8 @@ from specimap_infra.tables import Acquisition, CloudRow, Job
 CUBE_ROWS = 400
 POINTS_ACROSS = 750
 """Columns of the cube's middle that have points: 300,000 with its 400 rows."""
+FULL_ACROSS = 1172
+"""With the 1024 rows of a full-size cube, 1.2 million points."""
 MM_PER_PIXEL = 0.1
 
 
@@ -62,12 +64,31 @@ class Result:
         return f"/v1/clouds/{self.cloud_id}"
 
 
-def put_result(served: Served, work: Path) -> Result:
-    """Give a running service a cloud of 300,000 points and 290 bands, as a worker leaves it."""
+def full_cube_file(work: Path) -> Path:
+    """Header of a cube of 760 MB (1280 x 1024 x 290, uint16, BIL); made once."""
+    header = work / "full.hdr"
+    if not header.exists():
+        write_envi_cube(enlarge(SAMPLE / "hsi" / "hsi.hdr", ROWS, COLS, BANDS), header, "uint16", "bil")
+        os.sync()
+    return header
+
+
+def put_full_result(served: Served, work: Path) -> Result:
+    """Give a running service a cloud of a full-size cube: 1.2 million points and 290 bands."""
+    return put_result(served, work, full_cube_file(work), (ROWS, FULL_ACROSS))
+
+
+def put_result(
+    served: Served, work: Path, header: Path | None = None, size: tuple[int, int] = (CUBE_ROWS, POINTS_ACROSS)
+) -> Result:
+    """Give a running service a cloud of 290 bands, as a worker leaves it; by default 300,000 points.
+
+    ``size``: rows of ``header``'s cube that have points, and how many of its columns.
+    """
     job_id, cloud_id, acquisition_id = new_id("job"), new_id("cloud"), new_id("acq")
     storage, prefix = Storage.open(served.settings), f"jobs/{job_id}/register/{new_id('att')}"
     with storage.publishing(prefix) as folder:
-        write_cloud(folder / "cloud.zarr", _points(), open_cube(cube_file(work)), {})
+        write_cloud(folder / "cloud.zarr", _points(*size), open_cube(header or cube_file(work)), {})
     group = storage.path(f"{prefix}/cloud.zarr")
     assert group is not None
     cloud, now = Cloud.open(group), utc_now()
@@ -124,14 +145,14 @@ def folder_bytes(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
-def _points() -> CloudPoints:
+def _points(rows: int, across: int) -> CloudPoints:
     """Points of the middle of the cube on a wavy surface."""
-    row, col = np.divmod(np.arange(CUBE_ROWS * POINTS_ACROSS), POINTS_ACROSS)
+    row, col = np.divmod(np.arange(rows * across), across)
     n = len(row)
     rng = np.random.default_rng(0)
     normal = rng.normal(size=(n, 3)).astype(np.float32)
     return CloudPoints(
-        hsi_pixel=np.stack([row, col + (COLS - POINTS_ACROSS) // 2], 1).astype(np.uint16),
+        hsi_pixel=np.stack([row, col + (COLS - across) // 2], 1).astype(np.uint16),
         xyz=np.stack([MM_PER_PIXEL * col, -MM_PER_PIXEL * row, np.sin(row / 90) * np.cos(col / 70)], 1).astype(
             np.float32
         ),

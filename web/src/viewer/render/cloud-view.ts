@@ -30,6 +30,7 @@ export interface Ring {
 
 const FIELD_OF_VIEW = 30;
 const REST_MS = 180;
+const LONGEST_REST_MS = 2000;
 
 export class CloudView {
   readonly renderer: WebGLRenderer;
@@ -60,6 +61,7 @@ export class CloudView {
   private lastFrame = 0;
   private askedAt = 0;
   private drawMs = 0;
+  private wholeMs = 0;
   private wasMoving = false;
   private moving = false;
   private rest: ReturnType<typeof setTimeout> | undefined;
@@ -75,7 +77,7 @@ export class CloudView {
     this.renderer = new WebGLRenderer({ canvas, antialias: true, powerPreference: "high-performance" });
     // Colours are measured or chosen: they go to the screen as they are.
     this.renderer.outputColorSpace = LinearSRGBColorSpace;
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    this.setSharpness(1);
     this.camera.up.set(0, 0, 1);
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.enableDamping = false;
@@ -122,7 +124,7 @@ export class CloudView {
     attribute(this.points, "colour").needsUpdate = true;
     if (this.coarse.visible) this.colourCoarse();
     this.onRecolour();
-    this.draw();
+    this.drawCoarsely();
   }
 
   setRings(rings: readonly Ring[]): void {
@@ -132,7 +134,7 @@ export class CloudView {
     this.rings.geometry.dispose();
     this.rings.geometry = geometry;
     this.rings.visible = rings.length > 0;
-    this.draw();
+    this.drawCoarsely();
   }
 
   /** Show half a space alone; null: all. */
@@ -140,7 +142,7 @@ export class CloudView {
     this.section = plane;
     for (const material of [this.material, this.coarseMaterial]) material.uniforms.plane.value.fromArray(plane ?? [0, 0, 0, 1]);
     this.onSection();
-    this.draw();
+    this.drawCoarsely();
   }
 
   get shownHalf(): Plane | null {
@@ -149,7 +151,7 @@ export class CloudView {
 
   setPointScale(scale: number): void {
     this.pointScale = scale;
-    this.draw();
+    this.drawCoarsely();
   }
 
   showPoints(shown: boolean): void {
@@ -234,6 +236,7 @@ export class CloudView {
     target: (width: number, height: number) => WebGLRenderTarget,
   ): void {
     const shown = this.scene.background;
+    this.setSharpness(1);
     this.scene.background = new Color().setStyle(background, LinearSRGBColorSpace);
     this.placeCamera();
     const perMm = (pixelsPerMm(this.projection()) * height) / this.canvas.clientHeight;
@@ -272,11 +275,20 @@ export class CloudView {
     this.canvas.dataset.frameMs = String(Math.round(now - this.lastFrame));
     this.lastFrame = now;
     this.placeCamera();
+    this.setSharpness(moving && this.budget.exhausted ? 0.5 : 1);
     this.drawPoints(moving ? this.budget.moving : this.cloud.points, pixelsPerMm(this.projection()) * this.renderer.getPixelRatio());
     this.renderer.render(this.scene, this.camera);
     this.drawMs = performance.now() - began;
+    // How long a whole picture takes shows in when the next frame comes.
+    if (!moving) requestAnimationFrame(() => (this.wholeMs = performance.now() - began));
     if (this.moving) this.awaitRest();
     this.onFrame();
+  }
+
+  /** Draw fewer pixels than the screen has, or all. */
+  private setSharpness(share: number): void {
+    const ratio = Math.min(devicePixelRatio, 2) * share;
+    if (ratio !== this.renderer.getPixelRatio()) this.renderer.setPixelRatio(ratio);
   }
 
   private drawPoints(count: number, perMm: number): void {
@@ -311,7 +323,8 @@ export class CloudView {
       this.draw();
       if (this.handMoved) this.onRest();
       this.handMoved = false;
-    }, REST_MS);
+      // Where a whole picture holds up the page, it waits until a person does.
+    }, Math.min(Math.max(REST_MS, 2 * this.wholeMs), LONGEST_REST_MS));
   }
 
   /** The nearest and farthest that is drawn hug the cloud: depth is as fine as it can be. */
