@@ -1,4 +1,4 @@
-"""``python -m bench.service [--only spectrum|cloud|shard|upload|jobs|neighbour|scale|pages] [--repeats N] [--jobs N]``."""
+"""``python -m bench.service [--only PART] [--repeats N] [--jobs N]``; parts: :mod:`bench.service.parts`."""
 
 from __future__ import annotations
 

@@ -16,8 +16,9 @@ import {
 } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import type { Tile } from "../figure/figure-layout";
-import { CHUNK, NOWHERE, type PointCloud } from "../data/point-cloud";
+import type { PointCloud } from "../data/point-cloud";
 import { levelOrder } from "../data/shard-plan";
+import { CoarsePicture } from "./coarse-picture";
 import { DrawBudget } from "./draw-budget";
 import { pointMaterial, ringMaterial } from "./materials";
 import { pixelsPerMm, project, type Plane, type Projection } from "./projection";
@@ -49,10 +50,9 @@ export class CloudView {
   onFrame: () => void = () => undefined;
   private readonly scene = new Scene();
   private readonly material = pointMaterial();
-  private readonly coarseMaterial = pointMaterial();
   private readonly ringMaterial = ringMaterial();
   private readonly points: Points;
-  private readonly coarse: Points;
+  private readonly coarse: CoarsePicture;
   private readonly rings = new Points(new BufferGeometry(), this.ringMaterial);
   private readonly budget: DrawBudget;
   private readonly spacing: number;
@@ -86,11 +86,10 @@ export class CloudView {
     this.spacing = cloud.spacing();
     this.budget = new DrawBudget(cloud.points);
     this.points = this.fullPoints();
-    this.coarse = this.coarsePoints();
-    for (const object of [this.points, this.coarse, this.rings]) object.frustumCulled = false;
-    this.coarse.visible = !cloud.complete;
+    this.coarse = new CoarsePicture(cloud);
+    for (const object of [this.points, this.coarse.points, this.rings]) object.frustumCulled = false;
     this.rings.renderOrder = 10;
-    this.scene.add(this.points, this.coarse, this.extras, this.rings);
+    this.scene.add(this.points, this.coarse.points, this.extras, this.rings);
     this.watch = new ResizeObserver(() => this.resize());
     this.watch.observe(canvas);
     this.home();
@@ -112,17 +111,14 @@ export class CloudView {
     const position = attribute(this.points, "position");
     position.addUpdateRange(start * 3, points * 3);
     position.needsUpdate = true;
-    const centres = attribute(this.coarse, "position");
-    (centres.array as Float32Array).fill(NOWHERE, Math.floor(start / CHUNK) * 3, Math.ceil((start + points) / CHUNK) * 3);
-    centres.needsUpdate = true;
-    this.coarse.visible = !this.cloud.complete;
+    this.coarse.yieldTo(start, points);
     this.drawCoarsely();
   }
 
   /** Show the colours that have been written. */
   recolour(): void {
     attribute(this.points, "colour").needsUpdate = true;
-    if (this.coarse.visible) this.colourCoarse();
+    this.coarse.recolour(this.colours);
     this.onRecolour();
     this.drawCoarsely();
   }
@@ -140,7 +136,7 @@ export class CloudView {
   /** Show half a space alone; null: all. */
   setSection(plane: Plane | null): void {
     this.section = plane;
-    for (const material of [this.material, this.coarseMaterial]) material.uniforms.plane.value.fromArray(plane ?? [0, 0, 0, 1]);
+    for (const material of [this.material, this.coarse.material]) material.uniforms.plane.value.fromArray(plane ?? [0, 0, 0, 1]);
     this.onSection();
     this.drawCoarsely();
   }
@@ -299,8 +295,7 @@ export class CloudView {
     size.value = this.spacing * 1.6 * wider * this.pointScale;
     least.value = Math.min(2, wider) * this.renderer.getPixelRatio() * 0.75;
     scale.value = perMm;
-    this.coarseMaterial.uniforms.size.value = this.spacing * 22;
-    this.coarseMaterial.uniforms.perMm.value = perMm;
+    this.coarse.setScale(this.spacing, perMm);
   }
 
   private moved(): void {
@@ -354,31 +349,6 @@ export class CloudView {
     geometry.setAttribute("colour", new BufferAttribute(this.colours, 4, true));
     geometry.setIndex(new BufferAttribute(levelOrder(this.cloud.points), 1));
     return new Points(geometry, this.material);
-  }
-
-  /** One large point for each chunk of the cloud, at the middle of its box. */
-  private coarsePoints(): Points {
-    const { boxes } = this.cloud;
-    const chunks = boxes.length / 6;
-    const centres = Float32Array.from({ length: chunks * 3 }, (_, i) => {
-      const at = Math.floor(i / 3) * 6 + (i % 3);
-      if (this.cloud.known[Math.floor(i / 3)]) return NOWHERE;
-      return ((boxes[at] ?? 0) + (boxes[at + 3] ?? 0)) / 2;
-    });
-    const geometry = new BufferGeometry();
-    geometry.setAttribute("position", new BufferAttribute(centres, 3));
-    geometry.setAttribute("colour", new BufferAttribute(new Uint8Array(chunks * 4).fill(255), 4, true));
-    return new Points(geometry, this.coarseMaterial);
-  }
-
-  private colourCoarse(): void {
-    const colour = attribute(this.coarse, "colour");
-    for (let chunk = 0; chunk < colour.count; chunk++) {
-      // A point from the middle of the chunk stands for it.
-      const from = Math.min(chunk * CHUNK + CHUNK / 2, this.cloud.points - 1) * 4;
-      for (let c = 0; c < 4; c++) (colour.array as Uint8Array)[chunk * 4 + c] = this.colours[from + c] ?? 0;
-    }
-    colour.needsUpdate = true;
   }
 }
 
