@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Builds the images without a Docker engine, and runs what is in them: for machines that reach only the package archives
-# of Debian and Python. Debian 13 with its own Python replaces the base image; the rest is the Dockerfile.
+# of Debian, Python and npm. Debian 13 with its own Python replaces the base image; the rest is the Dockerfile.
 #   docker/check_images.sh [service|worker-cpu|worker-gpu ...]        (default: service worker-cpu)
 # Needs root, buildah and debootstrap (apt-get install buildah debootstrap), the network, some minutes and, in
 # CHECK_IMAGES_DIR (default: a folder that is removed at the end), up to 30 GB of disk.
@@ -29,6 +29,7 @@ base=localhost/python-stand-in
 trusted=()
 [ -z "${SSL_CERT_FILE:-}" ] || trusted=(--volume "$(dirname "$SSL_CERT_FILE"):/etc/ssl/certs:ro")
 [ -z "${PIP_CONF:-}" ] || trusted+=(--secret "id=pip,src=$PIP_CONF")
+[ -z "${NPM_CONF:-}" ] || trusted+=(--secret "id=npm,src=$NPM_CONF")
 
 if ! "${tool[@]}" images --quiet $base >/dev/null 2>&1; then
     echo "== base: Debian 13 by debootstrap"
