@@ -28,6 +28,7 @@ OF_PATHS = {
     "cloud_id": f"cloud_{'0' * 26}",
     "key_id": f"key_{'0' * 26}",
     "project_id": f"prj_{'0' * 26}",
+    "share_id": f"shr_{'0' * 26}",
     "upload_id": f"up_{'0' * 26}",
     "uuid": f"up_{'0' * 26}",
     "name": "layer",

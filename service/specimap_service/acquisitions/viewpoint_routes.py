@@ -35,8 +35,8 @@ Shown = tuple[tuple[tuple[int, int], tuple[Square, ...]], ...]
 """Of each photo its size and its markers, as something that can be looked up."""
 
 
-@router.get("/acquisitions/{acquisition_id}/viewpoints", operation_id="acquisitions.list_viewpoints")
-async def list_viewpoints(
+@router.get("/acquisitions/{acquisition_id}/viewpoints", operation_id="acquisitions.get_viewpoints")
+async def get_viewpoints(
     context: Context, principal: Reader, placing: PlacingDep, request: Request, acquisition_id: AcquisitionId
 ) -> Viewpoints:
     """Tell from where each accepted photo was taken, as its markers show, and where to stand next."""

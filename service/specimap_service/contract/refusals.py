@@ -41,7 +41,7 @@ _TUS: tuple[Refusal, ...] = (
 
 OWN: dict[str, tuple[Refusal, ...]] = {
     "acquisitions.delete": (infra.JobConflictError, infra.StorageUnavailableError),
-    "acquisitions.list_viewpoints": _TURNS,
+    "acquisitions.get_viewpoints": _TURNS,
     "clouds.get": _CLOUD,
     "clouds.get_cameras": (*_RANGES, service.CamerasMissingError),
     "clouds.get_corners": _RANGES,
