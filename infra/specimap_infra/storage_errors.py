@@ -13,13 +13,17 @@ from specimap_core.atomic import disk_errors
 from specimap_core.errors import NotFoundError, OutputNotWritableError, StorageFullError
 from specimap_infra.errors import StorageUnavailableError
 
-PART = re.compile(r"^[A-Za-z0-9_=-][A-Za-z0-9._=-]*$")
+PART = re.compile(r"^[A-Za-z0-9_=-][A-Za-z0-9._=-]{0,254}$")
+"""No longer than a file's name may be."""
+LONGEST_KEY = 900
+"""Characters: S3 takes 1024 bytes, with the prefix of the settings."""
 
 
 def checked(key: str) -> str:
     """Return the key, if it is made of safe names. Raises NotFoundError: no other key ever exists."""
     parts = key.split("/")
-    if not all(PART.match(part) for part in parts):
+    # A store's refusal of a name that is too long would look like its absence.
+    if len(key) > LONGEST_KEY or not all(PART.match(part) for part in parts):
         raise not_found(key)
     return key
 

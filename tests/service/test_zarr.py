@@ -134,6 +134,9 @@ HOSTILE = (
     "",
     "zarr.json/",
     "zarr.json%00",
+    # Longer than a name and than a key may be.
+    f"spectra/{'a' * 256}",
+    f"spectra/c{'/0' * 600}",
     "spectra/zarr.json%00.png",
     "labels",
     "labels/",
