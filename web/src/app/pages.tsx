@@ -22,7 +22,8 @@ const PAGES: Record<string, () => Promise<Module>> = {
 /** Show the page of the address; `parts` are what follows its name. */
 export function CurrentPage() {
   const [name = "", ...parts] = path.value;
-  const load = PAGES[name];
+  // Whatever every object has is no page.
+  const load = Object.hasOwn(PAGES, name) ? PAGES[name] : undefined;
   if (load === undefined) return <p class="page">{t("notFound")}</p>;
   return <Loaded key={name} load={load} parts={parts} />;
 }

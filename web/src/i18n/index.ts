@@ -7,7 +7,7 @@ export type Language = keyof typeof LANGUAGES;
 const KEPT = "specimap.language";
 
 function first(): Language {
-  const known = (name: string): name is Language => name in LANGUAGES;
+  const known = (name: string): name is Language => Object.hasOwn(LANGUAGES, name);
   const wanted = [stored(), ...navigator.languages.map((name) => name.slice(0, 2))];
   return wanted.find((name): name is Language => name !== null && known(name)) ?? "en";
 }

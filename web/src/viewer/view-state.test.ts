@@ -31,7 +31,8 @@ it("writes nothing of the first state", () => {
 it.each([
   "camera=1,2,3", "camera=a,b,c,d,e,f", "mode=xray", "band=5", "band=-1", "band=1.5", "rgb=1,2", "rgb=1,2,9", "pair=,",
   "map=jet", "range=2,1", "range=0,0", "layer=../x", "opacity=7", "section=q,1,lower", "section=x,1", "shape=cube", "size=0",
-  "points=100", "points=-1,x",
+  "points=100", "points=-1,x", "map=constructor", "map=__proto__", "mode=__proto__", "camera=1e308,0,0,-1e308,0,0", "camera=0,0,1e7,0,0,0",
+  "camera=1,2,3,1,2,3", "range=-1e308,1e308", `section=x,${"9".repeat(40)},lower`,
 ])("takes no harm from %s", (text) => {
   expect(decode(new URLSearchParams(text), first, 100, 5)).toEqual(first);
 });

@@ -37,6 +37,10 @@ export interface ViewState {
 }
 
 export const MOST_CHOSEN = 8;
+/** Of a number in a link: beyond any value of a cube, and far from where arithmetic overflows. */
+const LARGEST = 1e15;
+/** mm: from a camera nearer to what it looks at, or farther from the markers, nothing is seen. */
+const NEAREST = 0.01, FARTHEST = 1e6;
 
 /** The state in which a cloud of so many bands opens. */
 export function firstState(wavelengths: readonly (number | null)[]): ViewState {
@@ -100,7 +104,7 @@ export function decode(query: URLSearchParams, first: ViewState, points: number,
   const text = (name: string): string | null => query.get(name);
   const numbers = (name: string, count?: number): number[] | null => {
     const found = text(name)?.split(",").map((part) => (part.trim() === "" ? NaN : Number(part)));
-    return found && found.every(Number.isFinite) && (count === undefined || found.length === count) ? found : null;
+    return found?.every((value) => Math.abs(value) <= LARGEST) && (count === undefined || found.length === count) ? found : null;
   };
   const isBand = (value: number): boolean => Number.isInteger(value) && value >= 0 && value < bandCount;
   const bandsOf = (name: string, count: number): number[] | null => {
@@ -114,7 +118,7 @@ export function decode(query: URLSearchParams, first: ViewState, points: number,
   const range = numbers("range", 2) as [number, number] | null;
   const map = text("map");
   return {
-    camera: (numbers("camera", 6) as ViewState["camera"] | null) ?? first.camera,
+    camera: cameraOf(numbers("camera", 6)) ?? first.camera,
     mode: MODES.find((mode) => mode === text("mode")) ?? first.mode,
     band: bandsOf("band", 1)?.[0] ?? first.band,
     bands: (bandsOf("rgb", 3) as [number, number, number] | null) ?? first.bands,
@@ -130,9 +134,16 @@ export function decode(query: URLSearchParams, first: ViewState, points: number,
   };
 }
 
+function cameraOf(found: number[] | null): ViewState["camera"] {
+  if (!found || found.some((value) => Math.abs(value) > FARTHEST)) return null;
+  const [x = 0, y = 0, z = 0, a = 0, b = 0, c = 0] = found;
+  return Math.hypot(x - a, y - b, z - c) < NEAREST ? null : [x, y, z, a, b, c];
+}
+
 function sectionOf(text: string | null): Section | null {
   const found = /^([xyz]),(-?\d+(?:\.\d+)?),(upper|lower)$/.exec(text ?? "");
-  return found ? { axis: found[1] as Axis, at: Number(found[2]), flip: found[3] === "upper" } : null;
+  const at = Number(found?.[2]);
+  return found && Math.abs(at) <= FARTHEST ? { axis: found[1] as Axis, at, flip: found[3] === "upper" } : null;
 }
 
 /** Three digits after the point: micrometres. Ranges of small reflectances keep more. */

@@ -12,7 +12,7 @@ export type ColourMapName = keyof typeof ANCHORS;
 export const COLOUR_MAPS = Object.keys(ANCHORS) as ColourMapName[];
 
 export function isColourMap(name: string | null): name is ColourMapName {
-  return name !== null && name in ANCHORS;
+  return name !== null && Object.hasOwn(ANCHORS, name);
 }
 
 const made = new Map<ColourMapName, Uint8Array>();
