@@ -69,6 +69,45 @@ def test_photos_and_cube_become_a_job(service: Running, window: Window) -> None:
     assert service.client().get(f"/v1/jobs/{job['id']}").json()["state"] == "cancelled"
 
 
+def test_field_that_is_folded_away_is_shown_when_it_is_wrong(service: Running, window: Window) -> None:
+    page = window.page
+    window.sign_in(service.url, service.key())
+    page.goto(f"{service.url}/#/capture")
+    field = page.locator("#accession")
+    page.locator("summary").click()
+    field.fill("two words")
+    page.locator("summary").click()
+    expect(field).to_be_hidden()
+    page.get_by_test_id("new-specimen-id").fill("SP-1")
+    page.get_by_test_id("create-acquisition").click()
+    expect(field).to_be_visible()
+
+
+def test_acquisition_begins_where_the_browser_keeps_nothing(service: Running, window: Window) -> None:
+    window.page.add_init_script(
+        "Storage.prototype.setItem = () => { throw new DOMException('full', 'QuotaExceededError') }"
+    )
+    begin(window, service)
+
+
+def test_many_markers_keep_within_the_page(service: Running, window: Window, tmp_path: Path) -> None:
+    begin(window, service)
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    board = np.full((1000, 1500), 255, np.uint8)
+    for marker in range(24):
+        row, column = divmod(marker, 6)
+        x, y = 50 + 240 * column, 50 + 240 * row
+        board[y : y + 180, x : x + 180] = cv2.aruco.generateImageMarker(dictionary, marker, 180)
+    cv2.imwrite(str(tmp_path / "board.png"), board)
+    pick(window.page, tmp_path / "board.png")
+    expect_judged(window.page, 1)
+    window.page.set_viewport_size({"width": 390, "height": 844})
+    assert window.page.get_by_test_id("photo-card").locator(".ids").evaluate("e => e.children.length") == 24
+    assert window.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    last = window.page.get_by_test_id("photo-card").locator(".ids > :last-child")
+    assert last.evaluate("e => e.getBoundingClientRect().right <= innerWidth")
+
+
 def test_the_whole_sample_is_enough(service: Running, window: Window) -> None:
     begin(window, service)
     pick(window.page, *photos())

@@ -34,6 +34,14 @@ function lastMarkers(): { edge: number; dictionary: Dictionary } {
   }
 }
 
+function keepMarkers({ edge_mm: edge, dictionary }: Request): void {
+  try {
+    localStorage.setItem(KEPT, JSON.stringify({ edge, dictionary }));
+  } catch {
+    // A browser that keeps nothing asks again next time.
+  }
+}
+
 export function NewAcquisition() {
   const [markers] = useState(lastMarkers);
   const [specimen, setSpecimen] = useState("");
@@ -61,7 +69,7 @@ export function NewAcquisition() {
     try {
       const params = { header: { "idempotency-key": token } };
       const made = await body(api.POST("/v1/acquisitions", { body: request, params }));
-      localStorage.setItem(KEPT, JSON.stringify({ edge: request.edge_mm, dictionary: request.dictionary }));
+      keepMarkers(request);
       go(["capture", made.id]);
     } catch (thrown) {
       const refused = asProblem(thrown);
@@ -95,7 +103,8 @@ export function NewAcquisition() {
         {t("specimenHint")}
       </p>
       <Barcode found={setSpecimen} />
-      <details>
+      {/* The browser shows what is wrong with a field only where the field is seen. */}
+      <details onInvalidCapture={(event) => (event.currentTarget.open = true)}>
         <summary>
           {t("markers")}: {markers.edge} mm, {markers.dictionary}
         </summary>
