@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import datetime
 import io
 import re
 import time
@@ -14,6 +15,7 @@ from PIL import Image
 from playwright.sync_api import Page, expect
 
 import specimap_client as sc
+from specimap_infra.database import utc_now
 from tests.support.browser_scene import Window
 from tests.support.result_scene import Result, put_result
 from tests.support.service_scene import Running
@@ -207,6 +209,40 @@ def test_shared_link_shows_this_cloud_alone_until_it_is_revoked(
         expect(visitor.get_by_test_id("viewer-canvas")).to_have_count(0)
     finally:
         guest.close()
+
+
+def test_shared_link_takes_no_session_away_unasked(service: Running, window: Window, result: Result) -> None:
+    ends = (utc_now() + datetime.timedelta(days=1)).isoformat()
+    made = service.client().post(
+        f"/v1/clouds/{result.cloud_id}/shares", json={"name": "tumour board", "expires_at": ends}
+    )
+    page = window.page
+    window.sign_in(service.url, service.key())
+    page.goto(f"{service.url}/#/shared/{made.json()['token']}")
+    expect(page.get_by_test_id("open-shared")).to_be_visible()
+    assert window.faults() == []
+    page.get_by_role("button", name="Stay signed in").click()
+    expect(page.get_by_role("heading", name="Acquisitions")).to_be_visible()
+    page.goto(f"{service.url}/#/shared/{made.json()['token']}")
+    page.get_by_test_id("open-shared").click()
+    expect(page.get_by_test_id("viewer-canvas")).to_have_attribute("data-state", "ready", timeout=60_000)
+    # Wherever the address leads, the result is what there is to see.
+    page.get_by_role("link", name="Specimap").click()
+    expect(page).to_have_url(re.compile(f"#/view/{result.cloud_id}"))
+    page.goto(f"{service.url}/#/admin")
+    expect(page.get_by_test_id("viewer-canvas")).to_be_visible()
+
+
+def test_report_stays_within_its_panel(service: Running, window: Window, result: Result) -> None:
+    page = open_viewer(window, service.url, service.key(), result)
+    panel = page.get_by_test_id("panel-quality")
+    panel.locator("summary").click()
+    expect(panel.get_by_role("cell").first).to_be_visible()
+    page.set_viewport_size({"width": 390, "height": 844})
+    for _ in range(2):
+        right, width = panel.locator("table").evaluate("e => [e.getBoundingClientRect().right, innerWidth]")
+        assert right <= width
+        page.set_viewport_size({"width": 1180, "height": 820})
 
 
 def test_scripts_before_the_first_picture_stay_within_their_budget(

@@ -3,7 +3,7 @@ import { useEffect } from "preact/hooks";
 import { registerSW } from "virtual:pwa-register";
 import { effect, signal } from "@preact/signals";
 import { CurrentPage } from "./app/pages";
-import { path } from "./app/route";
+import { path, setPath } from "./app/route";
 import { findSession, session, sessionProblem } from "./app/session";
 import { Shell } from "./app/shell";
 import { language } from "./i18n";
@@ -52,7 +52,15 @@ function Content() {
       <Loading />
     );
   }
-  return session.value === null ? <SignInPage /> : <CurrentPage />;
+  if (session.value === null) return <SignInPage />;
+  const { cloud_id } = session.value;
+  return cloud_id !== null && path.value[0] !== "view" ? <ToShared cloud={cloud_id} /> : <CurrentPage />;
+}
+
+/** Whoever came by a shared link sees its result wherever the address leads: there is nothing else to see. */
+function ToShared({ cloud }: { cloud: string }) {
+  useEffect(() => setPath(["view", cloud]), [cloud]);
+  return <Loading />;
 }
 
 const root = document.getElementById("app");

@@ -27,6 +27,12 @@ export function go(parts: readonly string[], values: Record<string, string> = {}
   location.hash = href(parts, values);
 }
 
+/** Show another page in place of this one: going back does not lead here again. */
+export function setPath(parts: readonly string[]): void {
+  history.replaceState(null, "", href(parts));
+  current.value = fragment();
+}
+
 /** Change what follows `?` without a new entry in the history. */
 export function setQuery(values: URLSearchParams): void {
   const text = values.toString();
