@@ -156,6 +156,37 @@ def test_labels_are_painted_saved_and_read_back_by_a_program(service: Running, w
     assert set(np.flatnonzero(distance < 1.0)) <= set(painted)
 
 
+def test_labels_that_are_not_saved_outlive_a_walk_to_another_page(
+    service: Running, window: Window, result: Result
+) -> None:
+    key = service.key()
+    page = open_viewer(window, service.url, key, result)
+    page.get_by_test_id("panel-labels").locator("summary").click()
+    page.get_by_test_id("new-layer").fill("margin")
+    page.get_by_test_id("begin-layer").click()
+    page.get_by_test_id("paint-tool").select_option("brush")
+    page.get_by_test_id("brush-radius").fill("1")
+    page.get_by_test_id("brush-radius").blur()
+    tap(page, 1800)
+    expect(page.get_by_test_id("save-labels")).to_be_enabled()
+    # The session ends, somebody signs in again, and goes back by way of another page.
+    page.context.clear_cookies()
+    page.get_by_role("link", name="Jobs").click()
+    page.get_by_label("Key", exact=True).fill(key)
+    page.get_by_role("button", name="Sign in").click()
+    expect(page.get_by_role("heading", name="Jobs")).to_be_visible()
+    page.evaluate("place => { location.hash = place }", f"#/view/{result.cloud_id}")
+    expect(page.get_by_test_id("viewer-canvas")).to_have_attribute("data-state", "ready", timeout=60_000)
+    page.get_by_test_id("layer").select_option("margin")
+    page.get_by_test_id("panel-labels").locator("summary").click()
+    expect(page.get_by_test_id("undo")).to_be_enabled()
+    page.get_by_test_id("save-labels").click()
+    expect(page.get_by_test_id("save-status")).to_contain_text("1", timeout=15_000)
+    with sc.Client(service.url, key) as client:
+        values = np.asarray(client.clouds.get(result.cloud_id).label("margin").values())
+    assert values[1800] == 1
+
+
 def test_labels_that_a_program_changed_meanwhile_are_not_overwritten(
     service: Running, window: Window, result: Result
 ) -> None:

@@ -1,5 +1,5 @@
 /** Painting labels: layer, class, tool, undo, save. */
-import { useEffect, useId, useMemo, useState } from "preact/hooks";
+import { useEffect, useId, useLayoutEffect, useMemo, useState } from "preact/hooks";
 import { ProblemBox } from "../../ui/boxes";
 import { fieldText } from "../../ui/form";
 import { distinct } from "../colour/colour-maps";
@@ -13,7 +13,8 @@ const NAME = "[a-z0-9_\\-]{1,64}";
 export default function LabelPanel({ model }: PanelProps) {
   const painter = useMemo(() => new Painter(model), [model]);
   const layer = model.layers.shown.value;
-  useEffect(() => painter.take(), [painter, layer]);
+  // Before anybody can paint.
+  useLayoutEffect(() => painter.take(), [painter, layer]);
   useEffect(() => () => painter.close(), [painter]);
   // Closing the window loses what is not saved: the browser asks.
   const dirty = painter.dirty.value;

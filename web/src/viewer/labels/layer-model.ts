@@ -3,6 +3,7 @@ import { signal } from "@preact/signals";
 import { asProblem, type Problem } from "../../api/problem";
 import { classColours, mostProbable, type LabelClass } from "./classes";
 import { listLayers, readLayer, type Label } from "./label-layers";
+import { unsavedLayer } from "./unsaved";
 
 export interface ShownLayer {
   name: string;
@@ -43,12 +44,17 @@ export class LayerModel {
     await this.read(name);
   }
 
-  /** Read the current version of a layer, or none. */
+  /** Read the current version of a layer, or none; one with changes that are not saved is shown with them. */
   async read(name: string | null): Promise<void> {
     const round = ++this.round;
     this.problem.value = null;
     if (name === null) {
       this.show(null);
+      return;
+    }
+    const unsaved = unsavedLayer(this.cloudId, name);
+    if (unsaved) {
+      this.show(unsaved.layer);
       return;
     }
     try {

@@ -9,6 +9,7 @@ import { EditHistory } from "./edit-history";
 import { readLayer, writeLayer } from "./label-layers";
 import type { ShownLayer } from "./layer-model";
 import { similarPoints } from "./similar";
+import { forget, keep, unsavedLayer, whoPaints } from "./unsaved";
 
 export type ToolName = "off" | "brush" | "lasso" | "similar";
 const FIRST: LabelClass[] = [
@@ -34,6 +35,7 @@ export class Painter {
   history: EditHistory | null = null;
   private of: ShownLayer | null = null;
   private seeking = new AbortController();
+  private readonly who = whoPaints();
 
   constructor(private readonly model: ViewerModel) {}
 
@@ -41,9 +43,12 @@ export class Painter {
   take(): void {
     const layer = this.model.layers.shown.value;
     if (layer === this.of || (layer && this.of && layer.values === this.of.values)) return;
+    if (layer?.name !== this.of?.name) this.keep();
     this.of = layer;
-    this.history = layer && new EditHistory(layer.values);
-    this.dirty.value = false;
+    const unsaved = layer && unsavedLayer(this.model.info.id, layer.name);
+    const same = unsaved?.layer.values === layer?.values;
+    this.history = (same && unsaved?.history) || (layer && new EditHistory(layer.values));
+    this.dirty.value = unsaved != null && same;
     this.conflict.value = false;
     this.problem.value = null;
     this.saved.value = null;
@@ -53,7 +58,11 @@ export class Painter {
 
   /** Begin a layer that the service does not have yet, empty or from probabilities. */
   begin(name: string, from: ShownLayer | null = null): void {
-    const { points } = this.model.info;
+    const { points, id } = this.model.info;
+    if (unsavedLayer(id, name)) {
+      this.model.patch({ layer: name });
+      return;
+    }
     const classes = from ? withUnlabelled(from.classes) : FIRST;
     const largest = Math.max(...classes.map(({ value }) => value));
     const values = largest > 255 ? new Uint16Array(points) : new Uint8Array(points);
@@ -101,6 +110,7 @@ export class Painter {
       this.change({ ...layer, version: label.version, madeBy: made });
       this.saved.value = label.version;
       this.dirty.value = false;
+      forget(this.model.info.id, this.who, layer.name);
       this.conflict.value = false;
       await this.model.layers.refresh();
     } catch (thrown) {
@@ -114,6 +124,7 @@ export class Painter {
 
   /** After a conflict: give up what was painted. */
   takeTheirs(): Promise<void> {
+    if (this.of) forget(this.model.info.id, this.who, this.of.name);
     return this.model.layers.read(this.of?.name ?? null);
   }
 
@@ -131,6 +142,12 @@ export class Painter {
   close(): void {
     this.seeking.abort();
     this.choose("off");
+    this.keep();
+  }
+
+  private keep(): void {
+    const { of: layer, history } = this;
+    if (layer && history && this.dirty.peek()) keep(this.model.info.id, this.who, { layer, history });
   }
 
   private toolOf(name: ToolName): Tool {

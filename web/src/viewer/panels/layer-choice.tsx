@@ -1,5 +1,6 @@
 /** Which label layer lies over the colours, its legend and opacity. */
 import { useEffect } from "preact/hooks";
+import { unsavedNames } from "../labels/unsaved";
 import { t } from "../texts";
 import type { PanelProps } from "../viewer";
 import { Choice, Slider } from "./fields";
@@ -8,7 +9,8 @@ export function LayerChoice({ model }: PanelProps) {
   const { layer, opacity } = model.state.value;
   const shown = model.layers.shown.value;
   useEffect(() => void model.layers.refresh(), [model]);
-  const names = new Set([...model.layers.list.value.map(({ name }) => name), ...(layer === null ? [] : [layer])]);
+  const stored = model.layers.list.value.map(({ name }) => name);
+  const names = new Set([...stored, ...unsavedNames(model.info.id), ...(layer === null ? [] : [layer])]);
   if (names.size === 0) return null;
   return (
     <>
