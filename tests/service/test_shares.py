@@ -17,6 +17,7 @@ from specimap_infra.database import utc_now
 from specimap_infra.tables import ApiKey, AuditEntry, Share, SignIn
 from specimap_service.auth.dependencies import check_shared
 from specimap_service.auth.keys import Principal
+from specimap_service.clouds import share_routes
 from specimap_service.contract.description import operations
 from tests.support.access_scene import CASES, World, make_world
 from tests.support.documented import check_refusal, contract
@@ -313,6 +314,24 @@ def test_what_no_share_may_be_is_refused(
     assert what is None or field["what"] == what
     with service.database.session() as session:
         assert session.scalars(sa.select(Share.id)).all() == []
+
+
+def test_a_result_has_a_bounded_number_of_valid_shares(
+    service: Running, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(share_routes, "MOST_VALID", 2)
+    cloud, maker = put_result(service, tmp_path / "result").cloud_id, service.client(["upload", "read"])
+    expires = (utc_now() + datetime.timedelta(days=1)).isoformat()
+
+    def made(name: str) -> httpx.Response:
+        return maker.post(f"/v1/clouds/{cloud}/shares", json={"name": name, "expires_at": expires})
+
+    first = made("a")
+    assert (first.status_code, made("b").status_code) == (201, 201)
+    refused = made("c")
+    assert (refused.status_code, refused.json()["code"]) == (413, "quota_exceeded")
+    assert maker.delete(f"/v1/clouds/{cloud}/shares/{first.json()['id']}").status_code == 204
+    assert made("c").status_code == 201
 
 
 def test_nobody_gives_what_their_key_does_not_have(service: Running, tmp_path: Path) -> None:

@@ -238,6 +238,9 @@ def test_shared_link_shows_this_cloud_alone_until_it_is_revoked(
         visitor.wait_for_timeout(2500)
         visitor.reload()
         expect(visitor.get_by_test_id("viewer-canvas")).to_have_count(0)
+        visitor.goto(link.strip())
+        expect(visitor.get_by_role("alert")).to_contain_text("not valid")
+        assert "sps_" not in visitor.url
     finally:
         guest.close()
 

@@ -19,10 +19,17 @@ from specimap_service.auth.keys import checked_name, derived_secret
 from specimap_service.auth.object_ids import CloudId, ShareId
 from specimap_service.auth.shares import MOST_DAYS, new_share, share_text
 from specimap_service.context import Context, audit
-from specimap_service.errors import ForbiddenError, IdempotencyConflictError, RequestInvalidError
+from specimap_service.errors import (
+    ForbiddenError,
+    IdempotencyConflictError,
+    QuotaExceededError,
+    RequestInvalidError,
+)
 from specimap_service.idempotency import IdempotencyKey, Repeatable, repeated
 from specimap_service.paging import After, MaybeLimit, Moment, Sort, listed, paged
 
+MOST_VALID = 100
+"""Of one result at a time."""
 router = APIRouter(prefix="/v1/clouds/{cloud_id}/shares", tags=["shares"])
 
 
@@ -85,6 +92,7 @@ def create_share(
 
     def make(session: Session, salt: str) -> tuple[str, NewShare]:
         load(session, principal, tables.CloudRow, cloud_id)
+        _check_room(session, cloud_id)
         row, token = new_share(
             cloud_id,
             wanted.name,
@@ -143,6 +151,18 @@ def revoke_share(
         row.revoked_at = row.revoked_at or utc_now()
         audit(session, principal.key_id, "share.revoke", share_id, cloud=cloud_id)
     keyring.forget()
+
+
+def _check_room(session: Session, cloud_id: str) -> None:
+    """Raise QuotaExceededError where a result has as many valid shares as it may have: each has a rate of its own."""
+    valid = tables.Share.revoked_at.is_(None) & (tables.Share.expires_at > utc_now())
+    count = sa.select(sa.func.count()).select_from(tables.Share).where(tables.Share.cloud_id == cloud_id, valid)
+    if (session.scalar(count) or 0) >= MOST_VALID:
+        raise QuotaExceededError(
+            f"The result has {MOST_VALID} shares that are valid.",
+            advice="Revoke those that are not needed any more.",
+            limit=MOST_VALID,
+        )
 
 
 def _found(session: Session, cloud_id: str, share_id: str) -> tables.Share:

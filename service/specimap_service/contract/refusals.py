@@ -79,6 +79,7 @@ OWN: dict[str, tuple[Refusal, ...]] = {
     "projects.create": (core.SettingsError, infra.JobConflictError),
     "projects.update": (core.SettingsError, infra.JobConflictError),
     "sessions.create": (service.UnauthorizedError, service.CrossSiteRequestError, service.RateLimitedError),
+    "shares.create": (service.QuotaExceededError,),
     "spectra.get_band": (*_ARRAYS, *_TURNS),
     "spectra.get_point": _CLOUD,
     "spectra.select": (*_ARRAYS, *_TURNS),

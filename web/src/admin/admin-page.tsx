@@ -1,5 +1,7 @@
 import { api, body, fetched, type Schemas } from "../api/client";
 import { usePolled } from "../api/polling";
+import { Problem } from "../api/problem";
+import { may } from "../app/session";
 import { bytes, moment, number } from "../i18n";
 import { stateName, type StateKey } from "../i18n/states";
 import { ProblemBox } from "../ui/boxes";
@@ -11,6 +13,14 @@ import { t } from "./texts";
 
 /** Keys, projects, workers, queue, storage and the audit trail; for administrators. */
 export default function AdminPage() {
+  if (!may("admin")) {
+    const refused = new Problem("forbidden", "The key lacks the scope 'admin'.", "", 403, { scope: "admin" });
+    return (
+      <div class="page">
+        <ProblemBox problem={refused} />
+      </div>
+    );
+  }
   return (
     <div class="page">
       <h1>{t("title")}</h1>

@@ -6,13 +6,13 @@ import { Action } from "../ui/action";
 import { ProblemBox } from "../ui/boxes";
 import { t } from "./texts";
 
-const FORMATS: { format: Schemas["FileFormat"]; what: string }[] = [
+const FORMATS: { format: Schemas["FileFormat"]; what: string; of?: "mesh" | "points" }[] = [
   { format: "pdf", what: "PDF" },
   { format: "html", what: "HTML" },
-  { format: "mesh-ply", what: "PLY (mesh)" },
-  { format: "mesh-stl", what: "STL (mesh)" },
-  { format: "mesh-glb", what: "GLB (mesh)" },
-  { format: "ply", what: "PLY (points)" },
+  { format: "mesh-ply", what: "PLY", of: "mesh" },
+  { format: "mesh-stl", what: "STL", of: "mesh" },
+  { format: "mesh-glb", what: "GLB", of: "mesh" },
+  { format: "ply", what: "PLY", of: "points" },
   { format: "las", what: "LAS" },
   { format: "csv", what: "CSV" },
   { format: "npz", what: "NPZ" },
@@ -30,7 +30,8 @@ export function Downloads({ cloud }: { cloud: string }) {
       <h2>{t("downloads")}</h2>
       {made.problem && <ProblemBox problem={made.problem} again={made.again} />}
       <div class="row">
-        {FORMATS.map(({ format, what }) => {
+        {FORMATS.map(({ format, what: name, of }) => {
+          const what = of ? `${name} (${t(of)})` : name;
           const item = known.get(format);
           if (item?.state === "succeeded") {
             return (

@@ -35,7 +35,12 @@ export function SharedPage({ token }: { token: string }) {
         history.replaceState(null, "", "#/");
         go(["view", made.cloud_id ?? ""], view);
       },
-      (thrown: unknown) => setProblem(asProblem(thrown)),
+      (thrown: unknown) => {
+        const refused = asProblem(thrown);
+        // What is refused for good leaves the address; after a loss of the connection a reload tries again.
+        if (refused.status >= 400 && refused.status < 500) history.replaceState(null, "", "#/");
+        setProblem(refused);
+      },
     );
   }, [token, opens]);
   if (problem) return <ProblemBox problem={problem} />;
