@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
 import statistics
 from pathlib import Path
 from typing import Any
 
 from playwright.sync_api import Page, sync_playwright
 
+from bench.chromium import ARGUMENTS, chromium
 from bench.service.options import Options
 from bench.service.scene import Result, put_full_result
 from bench.service.serving import Served, serving
@@ -18,17 +18,6 @@ TARGETS_MS = {"first_picture": 2000.0, "band": 150.0, "tap": 50.0}
 TARGET_FRAMES = 30.0
 TURNS_SECONDS = 3
 TAPS = 10
-ARGUMENTS = (
-    "--no-sandbox",
-    "--no-first-run",
-    "--disable-quic",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--ignore-gpu-blocklist",
-)
 NAMES = {
     "first_picture": "first picture, coarse",
     "all_points": "all points read and drawn",
@@ -93,7 +82,7 @@ def bench_pages(work: Path, options: Options) -> dict[str, Any]:
     Raises:
         FileNotFoundError: there is no Chromium.
     """
-    path = shutil.which("chromium") or shutil.which("google-chrome")
+    path = chromium()
     if path is None:
         raise FileNotFoundError("There is no Chromium: apt-get install chromium")
     runs: list[dict[str, Any]] = []

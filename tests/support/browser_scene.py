@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,29 +11,15 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
 
+from bench.chromium import ARGUMENTS, chromium
 from tests.support.places import ROOT, SAMPLES
 
 PAGES = ROOT / "service" / "specimap_service" / "pages"
 AXE = ROOT / "web" / "node_modules" / "axe-core" / "axe.min.js"
 SCREENSHOTS_VARIABLE = "BROWSER_SCREENSHOTS"
 """Where the pictures of the documents are made anew: BROWSER_SCREENSHOTS=docs/images."""
-CHROMIUM_VARIABLE = "BROWSER_CHROMIUM"
-NAMES = ("chromium", "chromium-browser", "google-chrome")
-# Chromium looks for updates and translations elsewhere unless it is told not to; WebGL is drawn by software.
-ARGUMENTS = (
-    "--no-sandbox",
-    "--no-first-run",
-    "--disable-quic",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    # The camera needs no permission.
-    "--use-fake-ui-for-media-stream",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--ignore-gpu-blocklist",
-    "--host-resolver-rules=MAP specimap.test 127.0.0.1",
-)
+# The camera needs no permission.
+OWN_ARGUMENTS = ("--use-fake-ui-for-media-stream", "--host-resolver-rules=MAP specimap.test 127.0.0.1")
 PLAIN_HOST = "specimap.test"
 """This machine under a name that is no secure context on plain HTTP, unlike 127.0.0.1: much is missing there."""
 TABLET = {"width": 1180, "height": 820}
@@ -74,10 +59,9 @@ class Window:
         ]
 
 
-def chromium() -> str:
+def browser_path() -> str:
     """The machine's Chromium; skips where there is none, and says how to get one."""
-    given = os.environ.get(CHROMIUM_VARIABLE)
-    found = given or next(filter(None, map(shutil.which, NAMES)), None)
+    found = chromium()
     if found is None:
         pytest.skip("there is no Chromium: apt-get install chromium, or name one in BROWSER_CHROMIUM")
     if not (PAGES / "index.html").is_file():
@@ -94,11 +78,11 @@ def write_camera(path: Path) -> None:
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     """A headless browser, for a module: while one runs, the process has an event loop that other modules lack."""
-    path, camera = chromium(), tmp_path_factory.mktemp("camera") / "camera.mjpeg"
+    path, camera = browser_path(), tmp_path_factory.mktemp("camera") / "camera.mjpeg"
     write_camera(camera)
     fake = ("--use-fake-device-for-media-stream", f"--use-file-for-fake-video-capture={camera}")
     with sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=path, args=[*ARGUMENTS, *fake])
+        started = playwright.chromium.launch(executable_path=path, args=[*ARGUMENTS, *OWN_ARGUMENTS, *fake])
         yield started
         started.close()
 

@@ -1,6 +1,5 @@
 /** Markers, cameras and photos: shown in the picture, a photo by its camera. */
-import { Group } from "three";
-import { useEffect, useMemo, useState } from "preact/hooks";
+import { useEffect, useState } from "preact/hooks";
 import { api, BASE, body, fetched } from "../../api/client";
 import { usePolled } from "../../api/polling";
 import { session } from "../../app/session";
@@ -13,6 +12,7 @@ import { project } from "../render/projection";
 import type { PanelProps } from "../viewer";
 import type { ViewerModel } from "../viewer-model";
 import { centreOf, directionOf, distanceToPlane, frustum, type PhotoCamera } from "./camera-geometry";
+import { useGroup } from "../render/use-group";
 
 const en = {
   markers: "Show the markers’ corners",
@@ -122,16 +122,8 @@ function PhotoPicture({ model, name }: PanelProps & { name: string }) {
 }
 
 function useDrawn(model: ViewerModel, data: Known | undefined, shown: { markers: boolean; cameras: boolean }, photo: PhotoCamera | null): void {
-  const group = useMemo(() => new Group(), []);
+  const group = useGroup(model);
   const view = model.view.value;
-  useEffect(() => {
-    if (!view) return;
-    view.extras.add(group);
-    return () => {
-      view.extras.remove(emptied(group));
-      view.draw();
-    };
-  }, [view, group]);
   useEffect(() => {
     if (!view || !data) return;
     emptied(group);

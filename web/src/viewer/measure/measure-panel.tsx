@@ -1,6 +1,5 @@
 /** Measuring on the picture: lengths, ways along the surface, angles, areas. */
-import { Group } from "three";
-import { useEffect, useMemo, useState } from "preact/hooks";
+import { useEffect, useState } from "preact/hooks";
 import { asProblem, type Problem } from "../../api/problem";
 import { number } from "../../i18n";
 import { ProblemBox } from "../../ui/boxes";
@@ -11,6 +10,7 @@ import type { Way } from "./geodesic";
 import { angleAt, deviationOfLength, distance, lengthOf, outlineArea, type Place } from "./geometry";
 import { surfaceGraph } from "./surface-source";
 import { t } from "./texts";
+import { useGroup } from "../render/use-group";
 
 const KINDS = ["off", "line", "surface", "angle", "area"] as const;
 type Kind = (typeof KINDS)[number];
@@ -28,17 +28,8 @@ export default function MeasurePanel({ model }: PanelProps) {
   const [points, setPoints] = useState<readonly Measured[]>([]);
   const [way, setWay] = useState<Way | null | "reading">(null);
   const [problem, setProblem] = useState<Problem | null>(null);
-  const group = useMemo(() => new Group(), []);
+  const group = useGroup(model);
   const view = model.view.value;
-
-  useEffect(() => {
-    if (!view) return;
-    view.extras.add(group);
-    return () => {
-      view.extras.remove(emptied(group));
-      view.draw();
-    };
-  }, [view, group]);
 
   useEffect(() => {
     if (kind === "off") return;
