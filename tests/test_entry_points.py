@@ -14,13 +14,14 @@ import pytest
 from specimap_core.threads import limit_blas_threads
 from tests.support.places import ROOT
 
-FOLDERS = ("core", "infra", "service", "workers", "cli", "validation")
+FOLDERS = ("core", "infra", "hospital", "service", "workers", "cli", "validation")
 READERS = {
     "cli/specimap_cli/app.py",
     "cli/specimap_cli/demo.py",
     "cli/specimap_cli/doctor.py",
     "cli/specimap_cli/validation.py",
-    "infra/specimap_infra/settings.py",
+    "infra/specimap_infra/settings/places.py",
+    "infra/specimap_infra/settings/service.py",
     "service/specimap_service/acquisitions/dependencies.py",
     "workers/specimap_workers/__main__.py",
     "workers/specimap_workers/stage_main.py",

@@ -20,13 +20,14 @@ from specimap_service import errors as service_errors
 from specimap_service.http_status import HTTP_STATUS
 from tests.support.places import ROOT
 
-FOLDERS = ("core", "infra", "service", "workers", "cli", "validation")
+FOLDERS = ("core", "infra", "hospital", "service", "workers", "cli", "validation")
 MAY_IMPORT = {
     "core": {"core"},
     "infra": {"core", "infra"},
+    "hospital": {"core", "infra", "hospital"},
     "workers": {"core", "infra", "workers"},
-    "service": {"core", "infra", "service"},
-    "cli": {"core", "infra", "workers", "service", "validation", "cli", "client"},
+    "service": {"core", "infra", "hospital", "service"},
+    "cli": {"core", "infra", "hospital", "workers", "service", "validation", "cli", "client"},
     "validation": {"core", "validation"},
 }
 CORE_ORDER = (

@@ -21,7 +21,7 @@ from tests.support.document_scene import folder_of, full_report
 from tests.support.places import ROOT
 from tests.support.scenes import specimap
 
-SOURCES = ("core", "infra", "service", "workers", "cli", "validation", "client/src", "bench")
+SOURCES = ("core", "infra", "hospital", "service", "workers", "cli", "validation", "client/src", "bench")
 ELSEWHERE = {
     # These run in an interpreter without Specimap; what reads them writes strictly.
     "bench/faults/stand_in.py",
