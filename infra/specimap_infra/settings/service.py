@@ -10,6 +10,7 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 
 from specimap_core.errors import SettingsError
 from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES, backends_from
+from specimap_infra.settings.fhir import FhirSettings
 from specimap_infra.settings.logging import LogSettings
 from specimap_infra.settings.places import PlaceSettings
 from specimap_infra.settings.retention import RetentionSettings
@@ -31,6 +32,7 @@ class ServiceSettings(
     # The last one's fields come first.
     LogSettings,
     RetentionSettings,
+    FhirSettings,
     WebhookSettings,
     WorkerSettings,
     UploadSettings,

@@ -6,6 +6,7 @@ from specimap_infra.tables.access import ApiKey, AuditEntry, Project, Share, Sig
 from specimap_infra.tables.acquisitions import Acquisition, StoredFile, Upload, UploadPart
 from specimap_infra.tables.base import Base, UtcDateTime
 from specimap_infra.tables.clouds import CloudRow, Export, LabelVersion
+from specimap_infra.tables.fhir import FhirNotice
 from specimap_infra.tables.jobs import Artefact, Delivery, Job, JobEvent, Lease, RepeatableRequest
 from specimap_infra.tables.names import FINAL_STATES, JOB_STATES, PRIORITIES, QUEUED, ROLES, SCOPES
 
@@ -24,6 +25,7 @@ __all__ = [
     "CloudRow",
     "Delivery",
     "Export",
+    "FhirNotice",
     "Job",
     "JobEvent",
     "LabelVersion",
