@@ -6,6 +6,7 @@ from specimap_infra.tables.access import ApiKey, AuditEntry, Project, Share, Sig
 from specimap_infra.tables.acquisitions import Acquisition, StoredFile, Upload, UploadPart
 from specimap_infra.tables.base import Base, UtcDateTime
 from specimap_infra.tables.clouds import CloudRow, Export, LabelVersion
+from specimap_infra.tables.hospital import DicomInstance, DicomSet, SealedStudy
 from specimap_infra.tables.jobs import Artefact, Delivery, Job, JobEvent, Lease, RepeatableRequest
 from specimap_infra.tables.names import FINAL_STATES, JOB_STATES, PRIORITIES, QUEUED, ROLES, SCOPES
 
@@ -23,6 +24,8 @@ __all__ = [
     "Base",
     "CloudRow",
     "Delivery",
+    "DicomInstance",
+    "DicomSet",
     "Export",
     "Job",
     "JobEvent",
@@ -30,6 +33,7 @@ __all__ = [
     "Lease",
     "Project",
     "RepeatableRequest",
+    "SealedStudy",
     "Share",
     "SignIn",
     "StoredFile",
