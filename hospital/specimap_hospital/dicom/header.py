@@ -130,7 +130,9 @@ class Header:
         meta.MediaStorageSOPInstanceUID = dataset.SOPInstanceUID
         meta.TransferSyntaxUID = transfer_syntax
         meta.ImplementationClassUID = IMPLEMENTATION_CLASS_UID
-        meta.ImplementationVersionName = "SPECIMAP_" + re.sub(r"[^0-9A-Z]+", "_", self.source.software_version.upper())[:7]
+        meta.ImplementationVersionName = (
+            "SPECIMAP_" + re.sub(r"[^0-9A-Z]+", "_", self.source.software_version.upper())[:7]
+        )
         return meta
 
     def _patient(self, dataset: Dataset) -> None:
@@ -201,4 +203,3 @@ def spaced_mm(dataset: Dataset, grid_mm: float, description: str) -> None:
 def ds(value: float) -> str:
     """A number as DICOM's DS."""
     return f"{value:.10g}"
-
