@@ -1,0 +1,78 @@
+"""Build the DICOM objects of a result: files and a study context in, DICOM files out; no database, no network.
+
+It reads files that came from outside, so callers run it by :mod:`specimap_hospital.dicom.confined`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from specimap_hospital.dicom.model import BandChoice, DicomObject, LeftOut, ResultSource, SegmentClass
+from specimap_infra.study_context import StudyContext
+
+Progress = Callable[[float], None]
+
+
+def build_first_set(
+    context: StudyContext,
+    source: ResultSource,
+    out: Path,
+    progress: Progress = lambda share: None,
+    left_out: Callable[[LeftOut], None] = lambda photo: None,
+) -> list[DicomObject]:
+    """Write the first set of objects of a result into the folder ``out``, each file whole or not at all.
+
+    These are the photos, top view and preview, the surface as STL, the accuracy figures as a structured report, the
+    report as PDF, and a key object selection. The same result and context give the same objects with the same UIDs.
+    A photo that cannot be read is told to ``left_out``, and the rest is written. ``progress`` hears shares of the work,
+    0..1; what it raises stops the work.
+
+    Raises:
+        NotFoundError: the folder lacks a file of a result, or its report is of a version that this one cannot read.
+        CloudDamagedError: cloud or mesh do not read.
+        StorageFullError, OutputNotWritableError: ``out`` cannot be written.
+    """
+    raise NotImplementedError
+
+
+def build_parametric_map(
+    context: StudyContext,
+    source: ResultSource,
+    out: Path,
+    choice: BandChoice,
+    progress: Progress = lambda share: None,
+) -> list[DicomObject]:
+    """Write bands or class probabilities of a result as a Parametric Map (float32), and the reference image that it
+    lies on, whose plane is the marker frame's, not one of the patient.
+
+    Raises:
+        NotFoundError: there is no such band, layer or column.
+        SettingsError: nothing or too much was chosen.
+        CloudDamagedError, StorageFullError, OutputNotWritableError: as :func:`build_first_set`.
+    """
+    raise NotImplementedError
+
+
+def build_segmentation(
+    context: StudyContext,
+    source: ResultSource,
+    out: Path,
+    label: str,
+    classes: Sequence[SegmentClass],
+    progress: Progress = lambda share: None,
+) -> list[DicomObject]:
+    """Write a label layer of classes as a Segmentation, and the reference image that it lies on.
+
+    Raises: as :func:`build_parametric_map`.
+    """
+    raise NotImplementedError
+
+
+def write_zip(objects: Sequence[DicomObject], target: Path) -> Path:
+    """Write the objects as a ZIP with a DICOMDIR, under names that say nothing of the patient.
+
+    Raises:
+        StorageFullError, OutputNotWritableError: ``target`` cannot be written.
+    """
+    raise NotImplementedError
