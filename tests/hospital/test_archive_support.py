@@ -35,11 +35,17 @@ def test_nothing_of_it_listens_outside(archive: RunningOrthanc) -> None:
 
 def test_it_reaches_a_peer_here(tmp_path: Path) -> None:
     asked = threading.Event()
+
+    def on_echo(_: evt.Event) -> int:
+        asked.set()
+        return 0
+
     ae = AE("PEER")
     ae.add_supported_context(Verification)
-    server = ae.start_server(("127.0.0.1", 0), block=False, evt_handlers=[(evt.EVT_C_ECHO, lambda _: asked.set() or 0)])
+    server = ae.start_server(("127.0.0.1", 0), block=False, evt_handlers=[(evt.EVT_C_ECHO, on_echo)])
+    assert server is not None
     try:
-        with orthanc(tmp_path / "orthanc", peers={"PEER": server.socket.getsockname()[1]}) as running:
+        with orthanc(tmp_path / "orthanc", peers={"PEER": server.server_address[1]}) as running:
             answer = httpx.post(
                 f"{running.url}/modalities/PEER/echo", json={}, auth=running.auth, timeout=30, trust_env=False
             )

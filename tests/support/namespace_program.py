@@ -80,7 +80,6 @@ def main() -> None:
     for descriptor, port in plan["inward"]:
         threading.Thread(target=forward, args=(socket.socket(fileno=descriptor), port), daemon=True).start()
     program = subprocess.Popen(plan["command"], stdin=subprocess.DEVNULL, preexec_fn=end_with_parent)
-    signal.signal(signal.SIGTERM, lambda *_: program.terminate())
     os._exit(program.wait() & 0xFF)
 
 

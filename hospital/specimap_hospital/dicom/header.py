@@ -12,7 +12,7 @@ from pydicom.sequence import Sequence
 
 from specimap_hospital.dicom.codes import SPECIMEN_CONTAINER
 from specimap_hospital.dicom.model import ResultSource
-from specimap_hospital.dicom.uids import IMPLEMENTATION_CLASS_UID, REVISION, derived_uid
+from specimap_hospital.dicom.uids import IMPLEMENTATION_CLASS_UID, REVISION, derived_uid, study_uid
 from specimap_infra.study_context import StudyContext
 
 MANUFACTURER = "Specimap"
@@ -48,8 +48,8 @@ class Header:
 
     @property
     def study_uid(self) -> str:
-        """The order's own study, or one of the acquisition."""
-        return self.context.study_instance_uid or derived_uid("study", self.source.acquisition_id)
+        """As of :func:`~specimap_hospital.dicom.uids.study_uid`."""
+        return study_uid(self.context, self.source)
 
     @property
     def specimen_identifier(self) -> str:

@@ -117,3 +117,36 @@ class BandChoice:
     bands: tuple[int, ...] = ()
     label: str | None = None
     columns: Mapping[int, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class BuildTask:
+    """What is to be built: the first set, or one of the objects on request; see :mod:`specimap_hospital.dicom.build`.
+
+    ``choice`` of a parametric map; ``label`` and ``classes`` of a segmentation. ``archive``: the name of a ZIP of all
+    objects that is written beside them.
+    """
+
+    what: Literal["first_set", "parametric_map", "segmentation"] = "first_set"
+    choice: BandChoice = field(default_factory=BandChoice)
+    label: str = ""
+    classes: tuple[SegmentClass, ...] = ()
+    archive: str | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """As JSON values, for a process of its own."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> BuildTask:
+        """From what :meth:`as_dict` gave."""
+        choice = values["choice"]
+        return cls(
+            what=values["what"],
+            choice=BandChoice(
+                tuple(choice["bands"]), choice["label"], {int(k): name for k, name in choice["columns"].items()}
+            ),
+            label=values["label"],
+            classes=tuple(SegmentClass(**item) for item in values["classes"]),
+            archive=values["archive"],
+        )

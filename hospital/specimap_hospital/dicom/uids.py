@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import uuid
 
+from specimap_hospital.dicom.model import ResultSource
+from specimap_infra.study_context import StudyContext
+
 _NAMESPACE = uuid.UUID("5a3c8c0e-41c1-5d0f-9b1e-6f0d0e8a7c31")
 REVISION = 1
-"""Part of each instance's UID: raise it when the objects of an unchanged result come out otherwise, since an archive may
-keep either of two different objects with one UID."""
+"""Part of each instance's UID. Raise it when the objects of an unchanged result come out otherwise: an archive may keep
+either of two different objects with one UID."""
 
 
 def derived_uid(*parts: str) -> str:
@@ -17,3 +20,8 @@ def derived_uid(*parts: str) -> str:
 
 IMPLEMENTATION_CLASS_UID = derived_uid("implementation")
 """Of the program that wrote a file."""
+
+
+def study_uid(context: StudyContext, source: ResultSource) -> str:
+    """The order's own study, or one of the acquisition."""
+    return context.study_instance_uid or derived_uid("study", source.acquisition_id)
