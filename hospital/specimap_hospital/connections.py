@@ -56,8 +56,18 @@ def quieten() -> None:
     _config.LOG_REQUEST_IDENTIFIERS = _config.LOG_RESPONSE_IDENTIFIERS = False
 
 
+def check_has_work(settings: ServiceSettings) -> None:
+    """Raise SettingsError where a process of the hospital's side has nothing to do."""
+    if not settings.has_hospital_process:
+        raise SettingsError(
+            "There is no archive to send to, and no DICOM port.",
+            advice="Set SPECIMAP_PACS_URL, SPECIMAP_PACS_HOST or SPECIMAP_DICOM_PORT; docs/pacs.md says more.",
+            setting="pacs_url",
+        )
+
+
 def tls_context(settings: ServiceSettings) -> ssl.SSLContext:
-    """Make the context of encrypted connections to the hospital's servers. Raises SettingsError for files that are none."""
+    """Make the context of encrypted connections to the hospital's servers. Raises SettingsError for wrong files."""
     try:
         # The system's certificates, which may include a hospital's own authority, where none is named.
         context = ssl.create_default_context(cafile=settings.hospital_ca_file or None)
@@ -66,7 +76,7 @@ def tls_context(settings: ServiceSettings) -> ssl.SSLContext:
     except (OSError, ssl.SSLError) as error:
         raise SettingsError(
             "The certificates for the hospital's servers do not read.",
-            advice="Name PEM files in SPECIMAP_HOSPITAL_CA_FILE, SPECIMAP_HOSPITAL_CERT_FILE, SPECIMAP_HOSPITAL_KEY_FILE.",
+            advice="Name PEM files in SPECIMAP_HOSPITAL_CA_FILE, _CERT_FILE and _KEY_FILE.",
             setting="hospital_ca_file",
         ) from error
     context.minimum_version = ssl.TLSVersion.TLSv1_2

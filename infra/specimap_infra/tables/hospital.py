@@ -37,7 +37,9 @@ class DicomSet(Base):
     id: Mapped[str] = mapped_column(primary_key=True)
     cloud_id: Mapped[str] = owned_by("clouds")
     options: Mapped[dict[str, Any]]
-    """What is made beyond the first set; empty for the first set, of which a cloud has one."""
+    """What is made beyond the first set; empty for the first set."""
+    first: Mapped[bool]
+    """Whether it is the first set, of which a cloud has one."""
     study_version: Mapped[int]
     """The study context that its objects were last asked for with."""
     state: Mapped[str] = mapped_column(index=True)
