@@ -95,6 +95,7 @@ def dicomweb(settings: ServiceSettings, url: str, *, token: str, user: str, pass
     import requests
     from dicomweb_client.web import DICOMwebClient
     from requests.adapters import HTTPAdapter
+    from requests.auth import HTTPBasicAuth
 
     context = tls_context(settings) if url.startswith("https://") else None
 
@@ -116,7 +117,7 @@ def dicomweb(settings: ServiceSettings, url: str, *, token: str, user: str, pass
     if token:
         session.headers["Authorization"] = f"Bearer {token}"
     elif user:
-        session.auth = (user.encode(), password.encode())
+        session.auth = HTTPBasicAuth(user.encode(), password.encode())
     client: DICOMwebClient = DICOMwebClient(
         url, session=session, callback=_bounded(seconds), chunk_size=2**31 - 1, timeout=(min(seconds, 10.0), seconds)
     )
@@ -194,7 +195,11 @@ def association(
     try:
         yield found
     finally:
-        if found.is_established:
-            found.release()
-        else:
-            found.abort()
+        _end(found)
+
+
+def _end(peer: Association) -> None:
+    if peer.is_established:
+        peer.release()
+    else:
+        peer.abort()

@@ -209,13 +209,3 @@ def current(held: Claim) -> sa.ColumnElement[bool]:
 def wait_seconds(attempt: int, longest: float) -> float:
     """How long to wait after an attempt: 5 s, then twice as long each time, up to ``longest``."""
     return float(min(FIRST_WAIT_SECONDS * 2.0 ** min(attempt - 1, 30), longest))
-
-
-def seconds_to_next(database: Database, now: datetime.datetime, most: float) -> float:
-    """How long until a set is due, at most ``most``. Raises DatabaseUnavailableError."""
-    with database.session() as session:
-        waiting = sa.select(sa.func.min(DicomSet.next_at)).where(
-            DicomSet.state == "waiting", DicomSet.held_until <= now
-        )
-        next_at = session.scalar(waiting)
-    return most if next_at is None else min(most, max(0.0, (next_at - now).total_seconds()))
