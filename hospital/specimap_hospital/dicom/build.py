@@ -8,7 +8,17 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from specimap_core.errors import PhotoUnreadableError
+from specimap_core.progress import within
+from specimap_hospital.dicom.documents import write_mesh, write_report
+from specimap_hospital.dicom.files import Written
+from specimap_hospital.dicom.header import Header
+from specimap_hospital.dicom.key_objects import write_key_objects
+from specimap_hospital.dicom.measurements import write_measurements
 from specimap_hospital.dicom.model import BandChoice, DicomObject, LeftOut, ResultSource, SegmentClass
+from specimap_hospital.dicom.photos import write_photo
+from specimap_hospital.dicom.pictures import read_preview, write_picture
+from specimap_hospital.dicom.result import open_result
 from specimap_infra.study_context import StudyContext
 
 Progress = Callable[[float], None]
@@ -33,7 +43,38 @@ def build_first_set(
         CloudDamagedError: cloud or mesh do not read.
         StorageFullError, OutputNotWritableError: ``out`` cannot be written.
     """
-    raise NotImplementedError
+    result, header = open_result(source.folder), Header(context, source)
+    photos, missing = _photos(header, out, within(progress, 0.0, 0.5), left_out)
+    canvas = result.canvas
+    top_view = write_picture(header, "top_view", canvas.rgb(result.cloud), canvas, out / "top-view.dcm")
+    picture = canvas.preview(read_preview(source.folder / "preview.png"))
+    preview = write_picture(header, "preview", picture, canvas, out / "preview.dcm")
+    progress(0.6)
+    mesh = write_mesh(header, out / "mesh.dcm")
+    progress(0.7)
+    measurements = write_measurements(header, result, top_view.dataset, missing, out / "measurements.dcm")
+    report = write_report(header, out / "report.dcm", within(progress, 0.7, 0.95))
+    chosen = [top_view, preview, measurements]
+    key_objects = write_key_objects(header, chosen, out / "key-objects.dcm")
+    progress(1.0)
+    return [written.made for written in (*photos, top_view, preview, mesh, measurements, report, key_objects)]
+
+
+def _photos(
+    header: Header, out: Path, progress: Progress, left_out: Callable[[LeftOut], None]
+) -> tuple[list[Written], list[LeftOut]]:
+    """The photos by name, each in an object; those that cannot be read are told and left out."""
+    found: list[Written] = []
+    missing: list[LeftOut] = []
+    named = sorted(header.source.photos.items())
+    for number, (_, path) in enumerate(named, 1):
+        try:
+            found.append(write_photo(header, path, number, out / f"photo-{number:03}.dcm"))
+        except PhotoUnreadableError as error:
+            missing.append(LeftOut(number, error.code, error.message))
+            left_out(missing[-1])
+        progress(number / len(named))
+    return found, missing
 
 
 def build_parametric_map(

@@ -16,6 +16,8 @@ from specimap_hospital.dicom.uids import IMPLEMENTATION_CLASS_UID, REVISION, der
 from specimap_infra.study_context import StudyContext
 
 MANUFACTURER = "Specimap"
+NO_SERIAL_NUMBER = "none"
+"""A program has none, but some objects must hold one."""
 RESEARCH = "research use only"
 _LONG_STRING = 64
 
@@ -31,8 +33,8 @@ class Series:
 
 
 PHOTOS = Series("photos", 1, "XC", f"Photos of the specimen ({RESEARCH})")
-TOP_VIEW = Series("top-view", 2, "XC", f"Top view with markers, from photos ({RESEARCH})")
-PREVIEW = Series("preview", 3, "XC", f"Spectral preview, principal components ({RESEARCH})")
+TOP_VIEW = Series("top-view", 2, "OT", f"Top view with markers, from photos ({RESEARCH})")
+PREVIEW = Series("preview", 3, "OT", f"Spectral preview, principal components ({RESEARCH})")
 MESH = Series("mesh", 4, "M3D", f"Surface, STL in mm ({RESEARCH})")
 MEASUREMENTS = Series("measurements", 5, "SR", f"Accuracy at the markers ({RESEARCH})")
 REPORT = Series("report", 6, "DOC", f"Accuracy report ({RESEARCH})")
@@ -71,6 +73,11 @@ class Header:
         """Of the program, as an observer."""
         return derived_uid("device")
 
+    @property
+    def frame_of_reference_uid(self) -> str:
+        """Of the result's marker frame."""
+        return derived_uid("frame", self.source.cloud_id)
+
     def series_uid(self, series: Series) -> str:
         """Of a series of this result in this study."""
         return derived_uid("series", self.study_uid, self.source.cloud_id, series.role)
@@ -96,9 +103,9 @@ class Header:
     def image(self, series: Series, sop_class: str, role: str, number: int) -> Dataset:
         """A new image with the shared modules and the specimen."""
         dataset = self.document(series, sop_class, role, number)
-        self.put_specimen(dataset)
-        dataset.AcquisitionContextSequence = Sequence()
+        self._specimen(dataset)
         dataset.BurnedInAnnotation = "NO"
+        dataset.PatientOrientation = None
         return dataset
 
     def document(self, series: Series, sop_class: str, role: str, number: int) -> Dataset:
@@ -108,8 +115,7 @@ class Header:
         self.put(dataset, series, role, number)
         return dataset
 
-    def put_specimen(self, dataset: Dataset) -> None:
-        """Set the specimen module."""
+    def _specimen(self, dataset: Dataset) -> None:
         context = self.context
         dataset.ContainerIdentifier = self.container_identifier
         dataset.IssuerOfTheContainerIdentifierSequence = _issuer(context.issuer_of_container_identifier)
@@ -152,7 +158,8 @@ class Header:
         dataset.StudyDate = da(context.study_date or self.source.created)
         dataset.StudyTime = tm(context.study_time) if context.study_date else tm(self.source.created)
         dataset.ReferringPhysicianName = context.referring_physician_name
-        dataset.StudyID = context.study_id
+        # As IHE's Scheduled Workflow does where the order names none; a DICOMDIR needs one.
+        dataset.StudyID = context.study_id or context.requested_procedure_id or "1"
         dataset.AccessionNumber = context.accession_number
         if context.issuer_of_accession_number:
             dataset.IssuerOfAccessionNumberSequence = _issuer(context.issuer_of_accession_number)
@@ -166,12 +173,27 @@ class Header:
         dataset.SeriesNumber = series.number
         dataset.SeriesDescription = series.description
         dataset.SeriesDate, dataset.SeriesTime = da(self.source.created), tm(self.source.created)
-        if context.requested_procedure_id and series.modality not in ("SR", "KO"):
+        if context.requested_procedure_id and series.modality in ("SR", "KO"):
+            dataset.ReferencedRequestSequence = Sequence([self._request()])
+        elif context.requested_procedure_id:
             request = Dataset()
             request.RequestedProcedureID = context.requested_procedure_id
             if context.scheduled_procedure_step_id:
                 request.ScheduledProcedureStepID = context.scheduled_procedure_step_id
             dataset.RequestAttributesSequence = Sequence([request])
+
+    def _request(self) -> Dataset:
+        """The requested procedure that a document fulfils."""
+        request = Dataset()
+        request.StudyInstanceUID = self.study_uid
+        request.ReferencedStudySequence = Sequence()
+        request.AccessionNumber = self.context.accession_number
+        request.PlacerOrderNumberImagingServiceRequest = ""
+        request.FillerOrderNumberImagingServiceRequest = ""
+        request.RequestedProcedureID = self.context.requested_procedure_id
+        request.RequestedProcedureDescription = ""
+        request.RequestedProcedureCodeSequence = Sequence()
+        return request
 
 
 def _issuer(namespace: str) -> Sequence:
@@ -191,13 +213,6 @@ def da(day: datetime.date | None) -> str:
 def tm(time: datetime.datetime | datetime.time | None) -> str:
     """A time as DICOM's TM, in whole seconds."""
     return f"{time:%H%M%S}" if time else ""
-
-
-def spaced_mm(dataset: Dataset, grid_mm: float, description: str) -> None:
-    """Say how large a pixel of an image without a plane is, and how that is known."""
-    dataset.PixelSpacing = [ds(grid_mm), ds(grid_mm)]
-    dataset.PixelSpacingCalibrationType = "FIDUCIAL"
-    dataset.PixelSpacingCalibrationDescription = description[:_LONG_STRING]
 
 
 def ds(value: float) -> str:
