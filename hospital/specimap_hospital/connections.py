@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 SILENT = ("pynetdicom", "pydicom", "dicomweb_client", "urllib3", "highdicom")
 LARGEST_ANSWER = 8 * 1024**2
 """Bytes of an answer to a question or to a STOW request."""
+AWAY = frozenset(
+    {"not_reachable", "no_answer", "tls_refused", "association_refused", "http_401", "http_403", "http_404", "http_429"}
+)
 _PIECE = 65536
 
 
@@ -40,6 +43,11 @@ class PeerError(Exception):
         super().__init__(reason)
         self.reason = reason
         self.passing = passing
+
+    @property
+    def away(self) -> bool:
+        """Whether the server answers nobody now, or not us, whatever it is asked."""
+        return self.reason in AWAY or self.reason.startswith("http_5")
 
 
 @cache

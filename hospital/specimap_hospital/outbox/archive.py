@@ -51,7 +51,7 @@ class Stow:
             with web_errors():
                 self._client.search_for_studies(search_filters={"StudyInstanceUID": "2.25.0"}, limit=1)
         except PeerError as error:
-            if error.reason in ("not_reachable", "no_answer", "tls_refused") or error.reason.startswith("http_5"):
+            if error.away and error.reason not in ("http_403", "http_404"):
                 raise
         return self
 
@@ -65,15 +65,13 @@ class Stow:
         with web_errors():
             answer = self._client.store_instances([dcmread(made.path)])
             taken = {str(item.ReferencedSOPInstanceUID) for item in answer.get("ReferencedSOPSequence") or ()}
-            failed = {
-                str(item.get("ReferencedSOPInstanceUID")): int(item.get("FailureReason") or 0)
-                for item in answer.get("FailedSOPSequence") or ()
-            }
-        if made.sop_instance_uid in failed:
-            code = failed[made.sop_instance_uid]
-            raise PeerError(f"failure_{code:04x}", passing=code in BUSY)
-        if made.sop_instance_uid not in taken:
-            raise PeerError("answer_unreadable")
+            # Of the one object that was sent, whether or not the archive can tell which one it was.
+            failed = [int(item.get("FailureReason") or 0) for item in answer.get("FailedSOPSequence") or ()]
+        if made.sop_instance_uid in taken:
+            return
+        if failed:
+            raise PeerError(f"failure_{failed[0]:04x}", passing=failed[0] in BUSY)
+        raise PeerError("answer_unreadable")
 
     def has(self, made: DicomObject) -> bool:
         """Whether QIDO-RS finds it."""

@@ -125,7 +125,11 @@ class Sender:
                 self._end(held, "failed", error.code)
         else:
             counts = counted(self._database, held.set_id)
-            self._end(held, "failed" if counts.get("failed") else "sent", "refused" if counts.get("failed") else None)
+            if counts.get("waiting"):
+                self._later(held, "not_taken")
+            else:
+                failed = "failed" in counts
+                self._end(held, "failed" if failed else "sent", "refused" if failed else None)
 
     def _send_one(self, held: Claim, archive: Archive, made: DicomObject, known: Known) -> None:
         """Send an object, and note how that ended. Raises PeerError where the archive cannot be asked any more."""
@@ -142,7 +146,7 @@ class Sender:
             settle(
                 self._database, held, known.id, "waiting" if error.passing else "failed", self._clock(), error.reason
             )
-            if error.passing:
+            if error.away:
                 raise
         else:
             settle(self._database, held, known.id, "sent", self._clock())
