@@ -13,10 +13,13 @@ IMAGING_PROCEDURE = CodedConcept("363679005", "SCT", "Imaging procedure")
 ENGLISH = CodedConcept("en-GB", "RFC5646", "English (United Kingdom)")
 QUALITATIVE_EVALUATIONS = CodedConcept("C0034375", "UMLS", "Qualitative Evaluations")
 OF_INTEREST = CodedConcept("113000", "DCM", "Of Interest")
+CONCEPT = CodedConcept("309825002", "SCT", "Spatial and Relational Concept")
+CLASSIFICATION = CodedConcept("123109", "DCM", "Manual Processing")
 
 MILLIMETRE = CodedConcept("mm", "UCUM", "mm")
 PIXELS = CodedConcept("{pixels}", "UCUM", "pixels")
 PERCENT = CodedConcept("%", "UCUM", "%")
+COUNTS = CodedConcept("{counts}", "UCUM", "counts")
 NO_UNIT = CodedConcept("1", "UCUM", "no units")
 
 
