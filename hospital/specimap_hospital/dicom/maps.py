@@ -67,15 +67,20 @@ def write_map(header: Header, result: Result, choice: BandChoice, reference: Dat
         device_serial_number=NO_SERIAL_NUMBER,
         contains_recognizable_visual_features=False,
         real_world_value_mappings=[[_mapping(layer, frames[..., k])] for k, layer in enumerate(layers)],
-        window_center=(low + high) / 2,
-        window_width=max(high - low, 1e-3),
+        voi_lut_transformations=[_window(low, high)],
         transfer_syntax_uid=ExplicitVRLittleEndian,
         content_label="SPECIMAP_MAP",
         content_description=f"Marker frame, not patient axes; {RESEARCH}",
     )
-    found.FloatPixelPaddingValue = NO_VALUE
+    found.FloatPixelPaddingValue = found.FloatPixelPaddingRangeLimit = NO_VALUE
     header.put(found, series, role, 1)
+    header.put_specimen(found)
     return write_dataset(header, found, "parametric_map", target, ExplicitVRLittleEndian)
+
+
+def _window(low: float, high: float) -> hd.VOILUTTransformation:
+    # The usual function is for whole numbers: it takes no width below 1.
+    return hd.VOILUTTransformation((low + high) / 2, max(high - low, 1e-3), voi_lut_function="LINEAR_EXACT")
 
 
 def chosen_layers(result: Result, choice: BandChoice) -> list[Layer]:

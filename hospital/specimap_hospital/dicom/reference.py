@@ -1,7 +1,7 @@
 """The reference image of maps and segmentations: a top view that has a plane, the marker frame's.
 
-Viewers lay maps on images of one plane only. They may draw the letters of a patient's axes on it, which are false for an
-excised specimen; so the first set has no such image, and this one says what its axes are.
+Viewers lay maps on images of one plane only. They may draw the letters of a patient's axes on it, which are false for
+an excised specimen; so the first set has no such image, and this one says what its axes are.
 """
 
 from __future__ import annotations
@@ -36,7 +36,10 @@ def write_reference(header: Header, result: Result, target: Path) -> Written:
     put_spacing(image, canvas)
     _put_plane(header, image, canvas)
     put_rgb(image, canvas.rgb(result.cloud))
-    return write_dataset(header, image, "reference_image", target, ExplicitVRLittleEndian)
+    written = write_dataset(header, image, "reference_image", target, ExplicitVRLittleEndian)
+    # What lies on it states a thickness, though a surface has none.
+    written.dataset.SliceThickness = ds(canvas.grid_mm)
+    return written
 
 
 def _put_plane(header: Header, image: Dataset, canvas: Canvas) -> None:
@@ -45,4 +48,3 @@ def _put_plane(header: Header, image: Dataset, canvas: Canvas) -> None:
     image.FrameOfReferenceUID, image.PositionReferenceIndicator = header.frame_of_reference_uid, ""
     image.ImageOrientationPatient = [1, 0, 0, 0, -1, 0]
     image.ImagePositionPatient = [ds(x), ds(y), 0]
-    del image.PatientOrientation

@@ -66,6 +66,7 @@ def write_segmentation(
         content_description=f"Marker frame, not patient axes; {RESEARCH}",
     )
     header.put(found, series, role, 1)
+    header.put_specimen(found)
     return write_dataset(header, found, "segmentation", target, ExplicitVRLittleEndian)
 
 
