@@ -134,7 +134,7 @@ def write_preview(cloud: Cloud, path: Path, grid_mm: float = GRID_MM) -> None:
 
 
 def view_picture(view: TopView, colours: Array, shown: NDArray[np.bool_] | None = None) -> NDArray[np.uint8]:
-    """RGBA (rows, cols, 4) with y up: the mean of the colours (S, 3), 0..255, of each cell's topmost points, small holes
+    """RGBA (rows, cols, 4) with y up: mean of the colours (S, 3), 0..255, of each cell's topmost points, small holes
     filled; points that are not ``shown`` (S,) do not count."""
     top = view.top if shown is None else view.top & shown
     cell, size = view.cell[top], view.rows * view.cols

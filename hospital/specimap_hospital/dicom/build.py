@@ -14,11 +14,14 @@ from specimap_hospital.dicom.documents import write_mesh, write_report
 from specimap_hospital.dicom.files import Written
 from specimap_hospital.dicom.header import Header
 from specimap_hospital.dicom.key_objects import write_key_objects
+from specimap_hospital.dicom.maps import write_map
 from specimap_hospital.dicom.measurements import write_measurements
 from specimap_hospital.dicom.model import BandChoice, DicomObject, LeftOut, ResultSource, SegmentClass
 from specimap_hospital.dicom.photos import write_photo
 from specimap_hospital.dicom.pictures import read_preview, write_picture
+from specimap_hospital.dicom.reference import write_reference
 from specimap_hospital.dicom.result import open_result
+from specimap_hospital.dicom.segmentation import write_segmentation
 from specimap_infra.study_context import StudyContext
 
 Progress = Callable[[float], None]
@@ -92,7 +95,12 @@ def build_parametric_map(
         SettingsError: nothing or too much was chosen.
         CloudDamagedError, StorageFullError, OutputNotWritableError: as :func:`build_first_set`.
     """
-    raise NotImplementedError
+    result, header = open_result(source.folder), Header(context, source)
+    reference = write_reference(header, result, out / "reference.dcm")
+    progress(0.3)
+    found = write_map(header, result, choice, reference.dataset, out / "map.dcm")
+    progress(1.0)
+    return [reference.made, found.made]
 
 
 def build_segmentation(
@@ -107,13 +115,9 @@ def build_segmentation(
 
     Raises: as :func:`build_parametric_map`.
     """
-    raise NotImplementedError
-
-
-def write_zip(objects: Sequence[DicomObject], target: Path) -> Path:
-    """Write the objects as a ZIP with a DICOMDIR, under names that say nothing of the patient.
-
-    Raises:
-        StorageFullError, OutputNotWritableError: ``target`` cannot be written.
-    """
-    raise NotImplementedError
+    result, header = open_result(source.folder), Header(context, source)
+    reference = write_reference(header, result, out / "reference.dcm")
+    progress(0.3)
+    found = write_segmentation(header, result, label, classes, reference.dataset, out / "segmentation.dcm")
+    progress(1.0)
+    return [reference.made, found.made]

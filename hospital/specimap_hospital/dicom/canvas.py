@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,6 +104,14 @@ class Canvas:
         covered = np.zeros(len(found), bool)
         found[cells], covered[cells] = values[highest_first[first]], True
         return self._spread(found, covered, np.uint16(0))
+
+    @cached_property
+    def covered(self) -> NDArray[np.bool_]:
+        """Which pixels (rows, cols) show a point, or take the value of one nearby."""
+        there = np.zeros(self.view.rows * self.view.cols, bool)
+        there[self.view.cell] = True
+        source = nearest_covered(there.reshape(self.view.rows, self.view.cols))
+        return np.asarray(self.placed((source >= 0)[::-1]), bool)
 
     def _spread(self, values: Array, covered: NDArray[np.bool_], nothing: np.generic) -> Array:
         """Values of the view's cells, small holes filled, on the canvas."""

@@ -13,10 +13,12 @@ IMAGING_PROCEDURE = CodedConcept("363679005", "SCT", "Imaging procedure")
 ENGLISH = CodedConcept("en-GB", "RFC5646", "English (United Kingdom)")
 QUALITATIVE_EVALUATIONS = CodedConcept("C0034375", "UMLS", "Qualitative Evaluations")
 OF_INTEREST = CodedConcept("113000", "DCM", "Of Interest")
+CONCEPT = CodedConcept("309825002", "SCT", "Spatial and Relational Concept")
 
 MILLIMETRE = CodedConcept("mm", "UCUM", "mm")
 PIXELS = CodedConcept("{pixels}", "UCUM", "pixels")
 PERCENT = CodedConcept("%", "UCUM", "%")
+COUNTS = CodedConcept("{counts}", "UCUM", "counts")
 NO_UNIT = CodedConcept("1", "UCUM", "no units")
 
 
@@ -40,3 +42,4 @@ CHECK = own("check", "Check that failed")
 NOT_IN_STUDY = own("not_in_study", "Not in this study")
 MARKER_LAYOUT = own("marker_layout", "Printed markers around the specimen")
 MARKER_CORNER = own("marker_corner", "Corner of a printed marker")
+CLASSIFICATION = own("classification", "Classification of points, by a program or a person")

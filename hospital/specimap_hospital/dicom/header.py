@@ -103,7 +103,7 @@ class Header:
     def image(self, series: Series, sop_class: str, role: str, number: int) -> Dataset:
         """A new image with the shared modules and the specimen."""
         dataset = self.document(series, sop_class, role, number)
-        self._specimen(dataset)
+        self.put_specimen(dataset)
         dataset.BurnedInAnnotation = "NO"
         dataset.PatientOrientation = None
         return dataset
@@ -115,7 +115,8 @@ class Header:
         self.put(dataset, series, role, number)
         return dataset
 
-    def _specimen(self, dataset: Dataset) -> None:
+    def put_specimen(self, dataset: Dataset) -> None:
+        """Set the specimen module."""
         context = self.context
         dataset.ContainerIdentifier = self.container_identifier
         dataset.IssuerOfTheContainerIdentifierSequence = _issuer(context.issuer_of_container_identifier)

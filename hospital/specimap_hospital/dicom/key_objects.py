@@ -34,5 +34,9 @@ def write_key_objects(header: Header, chosen: Sequence[Written], target: Path) -
         manufacturer=MANUFACTURER,
         transfer_syntax_uid=ExplicitVRLittleEndian,
     )
+    for item in selection.ContentSequence:
+        # Its template allows a name on text alone; the library names the references, too.
+        if item.ValueType in ("IMAGE", "COMPOSITE"):
+            del item.ConceptNameCodeSequence
     header.put(selection, KEY_OBJECTS, KEY_OBJECTS.role, 1)
     return write_dataset(header, selection, "key_objects", target, ExplicitVRLittleEndian)

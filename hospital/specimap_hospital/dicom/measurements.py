@@ -14,6 +14,7 @@ import highdicom as hd
 import numpy as np
 from highdicom.sr import (
     AlgorithmIdentification,
+    CodeContentItem,
     CodedConcept,
     ContainerContentItem,
     ContentSequence,
@@ -26,7 +27,6 @@ from highdicom.sr import (
     ObservationContext,
     ObserverContext,
     PlanarROIMeasurementsAndQualitativeEvaluations,
-    QualitativeEvaluation,
     RelationshipTypeValues,
     SourceImageForRegion,
     SubjectContext,
@@ -103,11 +103,8 @@ def _context(header: Header) -> ObservationContext:
 
 def _groups(header: Header, result: Result, top_view: Dataset) -> list[PlanarROIMeasurementsAndQualitativeEvaluations]:
     report, image = result.report, SourceImageForRegion.from_source_image(top_view)
-    algorithm = AlgorithmIdentification(
-        name=MANUFACTURER,
-        version=header.source.software_version,
-        parameters=[f"method: {report.method}", f"backend: {report.backend}", f"adjustment: {report.adjustment}"],
-    )
+    settings = [f"method: {report.method}", f"backend: {report.backend}", f"adjustment: {report.adjustment}"]
+    algorithm = AlgorithmIdentification(MANUFACTURER, header.source.software_version, settings)
     around = result.canvas.pixels(result.corners.reshape(-1, 3)[:, :2])
     whole = PlanarROIMeasurementsAndQualitativeEvaluations(
         tracking_identifier=_tracking(header, "All markers"),
@@ -115,7 +112,6 @@ def _groups(header: Header, result: Result, top_view: Dataset) -> list[PlanarROI
         finding_type=codes.MARKER_LAYOUT,
         algorithm_id=algorithm,
         measurements=[Measurement(number.name, _rounded(number.value), number.unit) for number in summary(report)],
-        qualitative_evaluations=[QualitativeEvaluation(codes.VERDICT, codes.VERDICTS[verdict(report).level])],
     )
     place = {marker: k for k, marker in enumerate(result.marker_ids)}
     points = []
@@ -194,6 +190,9 @@ def _in_words(result: Result, left_out: Sequence[LeftOut]) -> ContainerContentIt
         is_content_continuous=False,
     )
     words.ContentSequence = ContentSequence(
-        [TextContentItem(name, text, RelationshipTypeValues.CONTAINS) for name, text in said]
+        [
+            CodeContentItem(codes.VERDICT, codes.VERDICTS[judged.level], RelationshipTypeValues.CONTAINS),
+            *(TextContentItem(name, text, RelationshipTypeValues.CONTAINS) for name, text in said),
+        ]
     )
     return words

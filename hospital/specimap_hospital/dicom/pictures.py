@@ -1,4 +1,4 @@
-"""Top view and spectral preview as Secondary Capture: in mm, without a plane: viewers would take it for the patient's."""
+"""Top view and spectral preview as Secondary Capture, in mm. A plane would be taken for one of the patient."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from pydicom import Dataset
 from pydicom.uid import ExplicitVRLittleEndian, SecondaryCaptureImageStorage
 
 from specimap_core.errors import CloudDamagedError
@@ -33,14 +34,19 @@ def write_picture(header: Header, kind: Kind, picture: NDArray[np.uint8], canvas
     image.ImageType = ["DERIVED", "SECONDARY"]
     image.ConversionType = "WSD"
     image.DerivationDescription = DERIVATIONS[kind]
-    image.PixelSpacing = [ds(canvas.grid_mm), ds(canvas.grid_mm)]
-    image.PixelSpacingCalibrationType = "FIDUCIAL"
-    image.PixelSpacingCalibrationDescription = CALIBRATION
+    put_spacing(image, canvas)
     put_rgb(image, picture)
     return write_dataset(header, image, kind, target, ExplicitVRLittleEndian)
 
 
-def put_rgb(image: object, picture: NDArray[np.uint8]) -> None:
+def put_spacing(image: Dataset, canvas: Canvas) -> None:
+    """Say how large a pixel is, and how that is known."""
+    image.PixelSpacing = [ds(canvas.grid_mm), ds(canvas.grid_mm)]
+    image.PixelSpacingCalibrationType = "FIDUCIAL"
+    image.PixelSpacingCalibrationDescription = CALIBRATION
+
+
+def put_rgb(image: Dataset, picture: NDArray[np.uint8]) -> None:
     """Set the pixels (rows, cols, 3) of an image, as they are."""
     rows, cols = picture.shape[:2]
     pixels = np.ascontiguousarray(picture).tobytes()
