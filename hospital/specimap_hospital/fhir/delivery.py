@@ -6,13 +6,19 @@ import datetime
 from collections.abc import Callable
 
 import sqlalchemy as sa
-from sqlalchemy.orm import Session
 
-from specimap_core.errors import SpecimapError
+from specimap_core.errors import CancelledError, SpecimapError, StorageFullError
 from specimap_hospital.fhir.client import FhirClient
 from specimap_hospital.fhir.elements import Element
 from specimap_hospital.fhir.errors import FhirUnavailableError
 from specimap_infra.database import Database, utc_now
+from specimap_infra.errors import (
+    DatabaseUnavailableError,
+    StageTimeoutError,
+    StorageUnavailableError,
+    StudyKeysMissingError,
+    WorkerCrashedError,
+)
 from specimap_infra.logs import logger
 from specimap_infra.tables import FhirNotice
 
@@ -20,15 +26,15 @@ CLAIM = datetime.timedelta(seconds=120)
 """How long a notice belongs to the process that sends it; if that one died, it is due again afterwards."""
 LONGEST_WAIT = datetime.timedelta(minutes=15)
 MOST_AT_ONCE = 20
-
-
-def tell_of(session: Session, cloud_id: str) -> None:
-    """Add a result that the server is to be told of, or tell it again."""
-    row = session.get(FhirNotice, cloud_id)
-    if row is None:
-        session.add(FhirNotice(cloud_id=cloud_id, state="pending", attempts=0, next_at=utc_now()))
-    else:
-        row.state, row.attempts, row.next_at, row.error = "pending", 0, utc_now(), None
+_PASSING = (
+    FhirUnavailableError,
+    StageTimeoutError,
+    StorageFullError,
+    StorageUnavailableError,
+    StudyKeysMissingError,
+    WorkerCrashedError,
+)
+"""What another attempt may not meet."""
 
 
 class FhirSender:
@@ -83,15 +89,22 @@ class FhirSender:
     def _send(self, cloud_id: str, attempt: int) -> None:
         try:
             self._client.post(self._bundle_of(cloud_id))
+        except DatabaseUnavailableError:
+            raise
+        except CancelledError:
+            # This process is to end: the next one goes on at once.
+            self._record(cloud_id, attempt, "pending", None, wait=False)
         except SpecimapError as error:
-            passes = isinstance(error, FhirUnavailableError)
+            passes = isinstance(error, _PASSING)
             state = "refused" if not passes else "given_up" if attempt >= self._attempts else "pending"
             self._record(cloud_id, attempt, state, error)
         else:
             self._record(cloud_id, attempt, "sent", None)
 
-    def _record(self, cloud_id: str, attempt: int, state: str, error: SpecimapError | None) -> None:
-        wait = min(datetime.timedelta(seconds=2.0 ** min(attempt, 20)), LONGEST_WAIT)
+    def _record(
+        self, cloud_id: str, attempt: int, state: str, error: SpecimapError | None, *, wait: bool = True
+    ) -> None:
+        pause = min(datetime.timedelta(seconds=2.0 ** min(attempt, 20)), LONGEST_WAIT) if wait else datetime.timedelta()
         with self._database.session() as session:
             session.execute(
                 # If another process has sent it meanwhile, its result counts.
@@ -99,7 +112,7 @@ class FhirSender:
                 .where(FhirNotice.cloud_id == cloud_id, FhirNotice.attempts == attempt, FhirNotice.state == "pending")
                 .values(
                     state=state,
-                    next_at=utc_now() + wait,
+                    next_at=utc_now() + pause,
                     error=None if error is None else error.as_dict(),
                     sent_at=utc_now() if state == "sent" else None,
                 )

@@ -7,6 +7,7 @@ from specimap_infra.tables.acquisitions import Acquisition, StoredFile, Upload, 
 from specimap_infra.tables.base import Base, UtcDateTime
 from specimap_infra.tables.clouds import CloudRow, Export, LabelVersion
 from specimap_infra.tables.fhir import FhirNotice
+from specimap_infra.tables.hospital import DicomInstance, DicomSet, SealedStudy
 from specimap_infra.tables.jobs import Artefact, Delivery, Job, JobEvent, Lease, RepeatableRequest
 from specimap_infra.tables.names import FINAL_STATES, JOB_STATES, PRIORITIES, QUEUED, ROLES, SCOPES
 
@@ -24,6 +25,8 @@ __all__ = [
     "Base",
     "CloudRow",
     "Delivery",
+    "DicomInstance",
+    "DicomSet",
     "Export",
     "FhirNotice",
     "Job",
@@ -32,6 +35,7 @@ __all__ = [
     "Lease",
     "Project",
     "RepeatableRequest",
+    "SealedStudy",
     "Share",
     "SignIn",
     "StoredFile",

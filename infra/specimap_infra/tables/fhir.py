@@ -18,6 +18,8 @@ class FhirNotice(Base):
     __tablename__ = "fhir_notices"
 
     cloud_id: Mapped[str] = mapped_column(sa.ForeignKey("clouds.id", ondelete="CASCADE"), primary_key=True)
+    study_version: Mapped[int]
+    """The study context that it was last told with: a changed one is told again."""
     state: Mapped[str]
     """``pending``, ``sent``, ``refused`` (it would be again) or ``given_up``."""
     attempts: Mapped[int] = mapped_column(default=0)

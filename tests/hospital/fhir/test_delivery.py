@@ -15,9 +15,10 @@ import sqlalchemy as sa
 
 from specimap_hospital.fhir.bundle import transaction
 from specimap_hospital.fhir.client import FhirClient
-from specimap_hospital.fhir.delivery import FhirSender, tell_of
+from specimap_hospital.fhir.delivery import FhirSender
 from specimap_hospital.fhir.elements import Element, Systems
 from specimap_hospital.fhir.errors import FhirRefusedError, FhirUnavailableError, PatientMissingError
+from specimap_hospital.fhir.notices import tell_of
 from specimap_infra.database import Database, utc_now
 from specimap_infra.settings import ServiceSettings, load_settings
 from specimap_infra.tables import CloudRow, FhirNotice, Job
@@ -57,7 +58,7 @@ def cloud(database: Database) -> str:
             )
         )
         session.flush()
-        tell_of(session, cloud_id)
+        tell_of(session, cloud_id, 1, utc_now())
     return cloud_id
 
 
@@ -88,7 +89,7 @@ def test_a_server_has_everything_once_however_often_it_is_told(
     assert notice(tables, cloud_id).state == "sent"
     assert server.requests[0]["Authorization"] == "Bearer t0p"
     with tables.session() as session:
-        tell_of(session, cloud_id)
+        tell_of(session, cloud_id, 1, utc_now())
     assert found.step() == 1
     counts = {kind: len(rows) for kind, rows in server.store.items()}
     assert counts == {"Specimen": 1, "ImagingStudy": 1, "Device": 1, "Observation": 4, "DiagnosticReport": 1}
@@ -155,7 +156,7 @@ def test_it_gives_up_after_the_attempts_and_goes_on_when_asked(
         found.step()
     assert notice(tables, cloud_id).state == "given_up"
     with tables.session() as session:
-        tell_of(session, cloud_id)
+        tell_of(session, cloud_id, 1, utc_now())
     found.step()
     assert notice(tables, cloud_id).state == "sent"
 

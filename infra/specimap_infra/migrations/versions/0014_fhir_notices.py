@@ -11,7 +11,7 @@ from alembic import op
 from specimap_infra.tables import UtcDateTime
 
 revision = "0014"
-down_revision = "0009"
+down_revision = "0010"
 branch_labels = None
 depends_on = None
 
@@ -21,6 +21,7 @@ def upgrade() -> None:
     op.create_table(
         "fhir_notices",
         sa.Column("cloud_id", sa.String(), nullable=False),
+        sa.Column("study_version", sa.Integer(), nullable=False),
         sa.Column("state", sa.String(), nullable=False),
         sa.Column("attempts", sa.Integer(), nullable=False),
         sa.Column("next_at", UtcDateTime(), nullable=False),

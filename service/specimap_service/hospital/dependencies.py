@@ -1,0 +1,33 @@
+"""Turns at asking the hospital's systems, which may take seconds to answer."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Annotated
+
+from fastapi import Depends, FastAPI
+
+from specimap_service.app_state import AppState
+from specimap_service.context import AppContext
+from specimap_service.fair_turns import FairTurns, TurnBounds
+from specimap_service.feature import Feature
+
+ASKING = AppState[FairTurns]("asking_hospital")
+ASKED = TurnBounds(at_once=4, of_key=2, waiting=32, waiting_of_key=4, retry_after_s=5)
+
+
+def _open(app: FastAPI, context: AppContext) -> None:
+    ASKING.set(app, FairTurns(ASKED))
+
+
+@asynccontextmanager
+async def _running(app: FastAPI) -> AsyncIterator[None]:
+    try:
+        yield
+    finally:
+        ASKING.of(app).close()
+
+
+FEATURE = Feature(_open, _running)
+AskingDep = Annotated[FairTurns, Depends(ASKING.of_request)]
