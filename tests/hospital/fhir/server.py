@@ -20,11 +20,13 @@ class FhirServer:
         self.store: dict[str, list[dict[str, Any]]] = {}
         self.answers: list[Answer | Callable[[], None]] = []
         self.requests: list[dict[str, str]] = []
+        self.bundles: list[dict[str, Any]] = []
         self.tokens: list[str] = []
         self.url = ""
 
     def transaction(self, bundle: dict[str, Any]) -> Answer:
         """Create and replace; refuse everything where a condition fits several."""
+        self.bundles.append(bundle)
         assert bundle["type"] == "transaction"
         assert len({entry["fullUrl"] for entry in bundle["entry"]}) == len(bundle["entry"])
         statuses = []

@@ -52,11 +52,8 @@ def wait_for(found: Callable[[], Any]) -> Any:
 
 
 def test_a_result_with_a_study_context_is_told(server: FhirServer, tmp_path: Path) -> None:
-    given = {"study_keys": [KEY], "fhir_url": server.url, "public_url": "https://specimap.example"}
-    bundles: list[dict[str, Any]] = []
-    transaction = server.transaction
-    server.transaction = lambda bundle: (bundles.append(bundle), transaction(bundle))[1]  # type: ignore[method-assign]
-    with serving(tmp_path / "service", **given) as running:  # type: ignore[arg-type]
+    given: dict[str, Any] = {"study_keys": [KEY], "fhir_url": server.url, "public_url": "https://specimap.example"}
+    with serving(tmp_path / "service", **given) as running:
         client = running.client()
         result = put_result(running, tmp_path / "result")
         address = f"/v1/clouds/{result.cloud_id}/fhir"
@@ -70,9 +67,9 @@ def test_a_result_with_a_study_context_is_told(server: FhirServer, tmp_path: Pat
             # Another context is told, too; the same one is not.
             changed = as_json(PATIENT.model_copy(update={"specimen_identifier": "SPEC-78"}))
             client.put(f"/v1/acquisitions/{result.acquisition_id}/study", json=changed).raise_for_status()
-            wait_for(lambda: len(bundles) == 2 and client.get(address).json()["state"] == "sent")
+            wait_for(lambda: len(server.bundles) == 2 and client.get(address).json()["state"] == "sent")
             assert client.post(address).status_code == 202
-            wait_for(lambda: len(bundles) == 3)
+            wait_for(lambda: len(server.bundles) == 3)
         with running.database.session() as session:
             figures = session.get_one(CloudRow, result.cloud_id).report
         events = client.get(f"/v1/jobs/{result.job_id}").text + client.get(address).text
@@ -85,7 +82,7 @@ def test_a_result_with_a_study_context_is_told(server: FhirServer, tmp_path: Pat
     values = [item["valueQuantity"]["value"] for item in server.store["Observation"] if "valueQuantity" in item]
     for figure in (figures["corner_2d_mm"]["mean"], figures["corner_3d_mm"]["median"], figures["sigma_mm"]["median"]):
         assert any(value == pytest.approx(figure, rel=1e-4) for value in values), figure
-    assert validated(bundles[-1]) == []
+    assert validated(server.bundles[-1]) == []
 
 
 def test_results_wait_for_their_objects_to_be_in_the_archive(tmp_path: Path) -> None:
