@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pynetdicom import AE
     from pynetdicom.association import Association
 
-SILENT = ("pynetdicom", "pydicom", "dicomweb_client", "urllib3", "highdicom")
+SILENT = ("pynetdicom", "pydicom", "dicomweb_client", "urllib3", "requests", "retrying", "highdicom")
 LARGEST_ANSWER = 8 * 1024**2
 """Bytes of an answer to a question or to a STOW request."""
 AWAY = frozenset(
@@ -199,6 +199,10 @@ def association(
     except (OSError, RuntimeError, ValueError):
         raise PeerError("not_reachable") from None
     if not found.is_established:
+        # The library leaves the socket of a connection that failed open.
+        link = found.dul.socket
+        if link is not None and link.socket is not None:
+            link.socket.close()
         raise PeerError("association_refused" if found.is_rejected else "not_reachable")
     try:
         yield found

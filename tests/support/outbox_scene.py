@@ -117,7 +117,5 @@ def small_objects(held: Claim, folder: Path, cancelled: Callable[[], bool], coun
         dataset.PixelData = bytes(4)
         path = folder / f"{number}.dcm"
         dataset.save_as(path, enforce_file_format=True)
-        made.append(
-            DicomObject(SECONDARY_CAPTURE, str(dataset.SOPInstanceUID), series, study, "photo", path)
-        )
+        made.append(DicomObject(SECONDARY_CAPTURE, str(dataset.SOPInstanceUID), series, study, "photo", path))
     return made
