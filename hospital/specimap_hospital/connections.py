@@ -199,10 +199,6 @@ def association(
     except (OSError, RuntimeError, ValueError):
         raise PeerError("not_reachable") from None
     if not found.is_established:
-        # The library leaves the socket of a connection that failed open.
-        link = found.dul.socket
-        if link is not None and link.socket is not None:
-            link.socket.close()
         raise PeerError("association_refused" if found.is_rejected else "not_reachable")
     try:
         yield found

@@ -28,6 +28,11 @@ from tests.support.service_scene import serving
 from tests.support.upload_scene import new_acquisition
 from tests.support.worklist_scene import wlmscpfs, write_entry
 
+pytestmark = pytest.mark.filterwarnings(
+    # pynetdicom drops the socket of a connection that was refused without closing it.
+    "ignore:Exception ignored in. <socket.socket:pytest.PytestUnraisableExceptionWarning"
+)
+
 
 @pytest.fixture(scope="module")
 def worklist(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningOrthanc]:
