@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pynetdicom import AE
     from pynetdicom.association import Association
 
-SILENT = ("pynetdicom", "pydicom", "dicomweb_client", "urllib3", "highdicom")
+SILENT = ("pynetdicom", "pydicom", "dicomweb_client", "urllib3", "requests", "retrying", "highdicom")
 LARGEST_ANSWER = 8 * 1024**2
 """Bytes of an answer to a question or to a STOW request."""
 AWAY = frozenset(

@@ -92,4 +92,4 @@ class HospitalProcess:
             return lambda: None
         from specimap_hospital.receive.listener import start_listener
 
-        return start_listener(self._database, self._storage, self._settings)
+        return start_listener(self._database, self._settings)

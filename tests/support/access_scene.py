@@ -261,6 +261,7 @@ CASES: dict[tuple[str, str], Case] = {
     ("GET", f"{ACQUISITION}/study"): Case("upload", aims=True),
     ("POST", "/v1/orders/search"): Case("upload", 409, _json(accession_number="1")),
     ("GET", f"{CLOUD}/dicom"): _read(),
+    ("GET", f"{CLOUD}/dicom.zip"): Case("upload", aims=True),
     ("POST", f"{CLOUD}/dicom"): Case("upload", 202, _json(), aims=True),
     ("POST", f"{CLOUD}/fhir"): Case("upload", 202, aims=True),
     ("GET", f"{CLOUD}/fhir"): _read(),

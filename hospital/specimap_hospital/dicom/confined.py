@@ -87,7 +87,7 @@ def build_confined(
             str(os.getpid()),
             str(limits.memory_bytes),
         ]
-        environment = {**bare_environment(), "TMPDIR": scratch, "MPLCONFIGDIR": scratch}
+        environment = {**bare_environment(), "TMPDIR": scratch}
         with JsonLineProcess(confined(command, reach, limits.sandbox), env=environment) as process:
             try:
                 process.send(request, REQUEST_SECONDS)

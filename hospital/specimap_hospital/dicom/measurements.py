@@ -41,7 +41,7 @@ from specimap_core.arrays import Floats
 from specimap_core.report.maps import spacing_mm
 from specimap_core.report.wording import UNKNOWN_WARNING_ADVICE, WARNING_ADVICE, checks, verdict
 from specimap_hospital.dicom import codes
-from specimap_hospital.dicom.figures import LEFT_OUT, RESIDUAL_MM, RESIDUAL_PX, Corner, corners_in_cube, summary
+from specimap_hospital.dicom.figures import Number, corners_in_cube, markers_left_out, summary
 from specimap_hospital.dicom.files import Written, write_dataset
 from specimap_hospital.dicom.header import MANUFACTURER, MEASUREMENTS, Header
 from specimap_hospital.dicom.model import LeftOut
@@ -102,68 +102,52 @@ def _context(header: Header) -> ObservationContext:
 
 
 def _groups(header: Header, result: Result, top_view: Dataset) -> list[PlanarROIMeasurementsAndQualitativeEvaluations]:
-    report, image = result.report, SourceImageForRegion.from_source_image(top_view)
+    """All markers with the summary, each marker, and each corner; a region without a number is none."""
+    report = result.report
     settings = [f"method: {report.method}", f"backend: {report.backend}", f"adjustment: {report.adjustment}"]
     algorithm = AlgorithmIdentification(MANUFACTURER, header.source.software_version, settings)
-    around = result.canvas.pixels(result.corners.reshape(-1, 3)[:, :2])
-    whole = PlanarROIMeasurementsAndQualitativeEvaluations(
-        tracking_identifier=_tracking(header, "All markers"),
-        referenced_region=ImageRegion(GraphicTypeValues.POLYLINE, _outline(around), image),
-        finding_type=codes.MARKER_LAYOUT,
-        algorithm_id=algorithm,
-        measurements=[Measurement(number.name, _rounded(number.value), number.unit) for number in summary(report)],
-    )
-    place = {marker: k for k, marker in enumerate(result.marker_ids)}
-    points = []
-    for corner in corners_in_cube(report, spacing_mm(result.cloud)):
-        if corner.marker in place:
-            at = around.reshape(-1, 4, 2)[place[corner.marker], corner.corner]
-            points.append(_point(header, result, corner, at, image, algorithm))
-    return [whole, *points]
+    image = SourceImageForRegion.from_source_image(top_view)
+    quads = result.canvas.pixels(result.corners.reshape(-1, 3)[:, :2]).reshape(-1, 4, 2) + _PIXEL_CENTRE
 
+    def group(
+        name: str, finding: CodedConcept, kind: GraphicTypeValues, at: Floats, numbers: Sequence[Number]
+    ) -> PlanarROIMeasurementsAndQualitativeEvaluations:
+        uid = derived_uid("region", header.instance_uid(MEASUREMENTS.role), name)
+        return PlanarROIMeasurementsAndQualitativeEvaluations(
+            tracking_identifier=TrackingIdentifier(uid=uid, identifier=name),
+            referenced_region=ImageRegion(kind, at, image),
+            finding_type=finding,
+            algorithm_id=algorithm,
+            measurements=[Measurement(number.name, _rounded(number.value), number.unit) for number in numbers],
+        )
 
-def _point(
-    header: Header,
-    result: Result,
-    corner: Corner,
-    at: Floats,
-    image: SourceImageForRegion,
-    algorithm: AlgorithmIdentification,
-) -> PlanarROIMeasurementsAndQualitativeEvaluations:
-    measured = [
-        Measurement(RESIDUAL_MM, _rounded(corner.residual_mm), codes.MILLIMETRE),
-        Measurement(RESIDUAL_PX, _rounded(corner.residual_px), codes.PIXELS),
-    ]
-    left = result.report.leave_one_marker_out_mm
-    of_marker = left.per_marker.get(str(corner.marker), float("nan")) if left is not None else float("nan")
-    if np.isfinite(of_marker):
-        measured.append(Measurement(LEFT_OUT, _rounded(of_marker), codes.MILLIMETRE))
-    return PlanarROIMeasurementsAndQualitativeEvaluations(
-        tracking_identifier=_tracking(header, f"Marker {corner.marker}, corner {corner.corner + 1}"),
-        referenced_region=ImageRegion(GraphicTypeValues.POINT, at.reshape(1, 2) + _PIXEL_CENTRE, image),
-        finding_type=codes.MARKER_CORNER,
-        algorithm_id=algorithm,
-        measurements=measured,
-    )
+    outline, point = GraphicTypeValues.POLYLINE, GraphicTypeValues.POINT
+    hull = cv2.convexHull(quads.reshape(-1, 2).astype(np.float32)).reshape(-1, 2).astype(float)
+    groups = [group("All markers", codes.MARKER_LAYOUT, outline, _closed(hull), summary(report))]
+    left_out, residuals = markers_left_out(report), corners_in_cube(report, spacing_mm(result.cloud))
+    for marker, quad in zip(result.marker_ids, quads, strict=True):
+        name = f"Marker {marker}"
+        if marker in left_out:
+            groups.append(group(name, codes.MARKER, outline, _closed(quad), [left_out[marker]]))
+        for k, corner in enumerate(quad):
+            if (marker, k) in residuals:
+                at, numbers = corner[None], [residuals[marker, k]]
+                groups.append(group(f"{name}, corner {k + 1}", codes.MARKER_CORNER, point, at, numbers))
+    return groups
 
 
 _PIXEL_CENTRE = 0.5
 """DICOM's image coordinates count from the top left corner of the top left pixel."""
 
 
-def _outline(around: Floats) -> Floats:
-    """The closed outline (n, 2) of points (m, 2): column, row."""
-    hull = cv2.convexHull(around.astype(np.float32)).reshape(-1, 2).astype(float)
-    return np.concatenate([hull, hull[:1]]) + _PIXEL_CENTRE
-
-
-def _tracking(header: Header, name: str) -> TrackingIdentifier:
-    return TrackingIdentifier(uid=derived_uid("region", header.instance_uid(MEASUREMENTS.role), name), identifier=name)
+def _closed(outline: Floats) -> Floats:
+    """An outline (n, 2) that ends where it begins."""
+    return np.concatenate([outline, outline[:1]])
 
 
 def _rounded(value: float) -> float:
-    """To six significant digits: DICOM's decimal strings hold 16 characters."""
-    return float(f"{value:.6g}")
+    """To four decimals: no more are shown, and viewers do not read exponents, in which small numbers are written."""
+    return round(value, 4)
 
 
 # ---- words --------------------------------------------------------------------------------------------

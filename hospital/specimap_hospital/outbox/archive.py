@@ -71,7 +71,8 @@ class Stow:
             return
         if failed:
             raise PeerError(f"failure_{failed[0]:04x}", passing=failed[0] in BUSY)
-        raise PeerError("answer_unreadable")
+        # Some say of what they cannot read neither that they took it nor that they did not.
+        raise PeerError("not_taken", passing=False)
 
     def has(self, made: DicomObject) -> bool:
         """Whether QIDO-RS finds it."""

@@ -184,7 +184,9 @@ class Sender:
         # An attempt that was broken off from here is none.
         counted = {"attempts": held.attempt - 1} if now else {}
         finish(self._database, held, at, next_at=at + self._span(wait), reason=reason, **counted)
-        logger().warning("dicom set waits", set=held.set_id, attempt=held.attempt, reason=reason, seconds=wait)
+        # An archive that is away for a day would fill the log.
+        log = logger().warning if held.attempt == 1 else logger().debug
+        log("dicom set waits", set=held.set_id, attempt=held.attempt, reason=reason, seconds=wait)
 
     def _end(self, held: Claim, state: str, reason: str | None) -> None:
         at = self._clock()

@@ -86,19 +86,14 @@ class HospitalSettings(StudySettings):
 
     dicom_host: str = Field(default="127.0.0.1", description="Address of the DICOM port.")
     dicom_port: int = Field(
-        default=0, ge=0, le=65535, description="Port for C-STORE, C-ECHO and the archive's commitment; 0: none."
+        default=0, ge=0, le=65535, description="Port for C-ECHO, C-STORE and the archive's commitment; 0: none."
+    )
+    dicom_tls: Literal["off", "on"] = Field(
+        default="off", description="Whether the DICOM port is encrypted; peers then show a certificate of the authority."
     )
     dicom_peers: list[str] = Field(
         default_factory=list,
-        description="Application entity titles that may send to the DICOM port, as a JSON list; none by default.",
-    )
-    dicom_project: str = Field(
-        default="",
-        description="Project, by id or name, that new acquisitions from the DICOM port go to; else the first.",
-    )
-    stow: Literal["off", "on"] = Field(default="off", description="Whether the API takes DICOM objects (STOW-RS).")
-    most_dicom_bytes: int = Field(
-        default=256 * 1024**2, ge=1, description="Largest DICOM object, and STOW-RS body, that is taken."
+        description="Application entity titles that may use the DICOM port besides the archive's, as a JSON list.",
     )
 
     @field_validator("orders_url", "pacs_url")

@@ -9,9 +9,10 @@ from specimap_infra.tables.clouds import CloudRow, Export, LabelVersion
 from specimap_infra.tables.fhir import FhirNotice
 from specimap_infra.tables.hospital import DicomInstance, DicomSet, SealedStudy
 from specimap_infra.tables.jobs import Artefact, Delivery, Job, JobEvent, Lease, RepeatableRequest
-from specimap_infra.tables.names import FINAL_STATES, JOB_STATES, PRIORITIES, QUEUED, ROLES, SCOPES
+from specimap_infra.tables.names import DICOM_STATES, FINAL_STATES, JOB_STATES, PRIORITIES, QUEUED, ROLES, SCOPES
 
 __all__ = [
+    "DICOM_STATES",
     "FINAL_STATES",
     "JOB_STATES",
     "PRIORITIES",

@@ -3,28 +3,37 @@
 from __future__ import annotations
 
 import datetime
+import os
 from collections import defaultdict
-from typing import Annotated, Any, Literal
+from collections.abc import Iterator
+from typing import Annotated, Any, BinaryIO, Literal
 
 import sqlalchemy as sa
 from fastapi import APIRouter, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 from sqlalchemy.orm import Session
 
+from specimap_hospital.outbox.making import make_objects
 from specimap_hospital.outbox.rows import request_set
+from specimap_hospital.outbox.workspaces import workspace
 from specimap_infra import tables
 from specimap_infra.database import utc_now
 from specimap_infra.errors import ArchiveMissingError
 from specimap_infra.studies import study_keys
 from specimap_service.auth.dependencies import Reader, Uploader
+from specimap_service.auth.keys import Principal
 from specimap_service.auth.object_ids import CloudId
 from specimap_service.clouds.dependencies import CloudsDep
-from specimap_service.context import Context, audit
+from specimap_service.context import AppContext, Context, audit
+from specimap_service.hospital.dependencies import MakingDep
 from specimap_service.paging import After, MaybeLimit, Sort, listed, paged
 
-router = APIRouter(prefix="/v1/clouds/{cloud_id}/dicom", tags=["hospital"])
+router = APIRouter(prefix="/v1/clouds/{cloud_id}", tags=["hospital"])
 DeliveryState = Literal["waiting", "sent", "committed", "failed"]
 MOST_BANDS = 32
+ARCHIVE = "dicom.zip"
 
 
 class DicomRequest(BaseModel):
@@ -85,7 +94,7 @@ class DicomSet(BaseModel):
     instances: list[DicomInstance] = Field(description="Empty until the objects were made for the first time.")
 
 
-@router.get("", operation_id="dicom.list")
+@router.get("/dicom", operation_id="dicom.list")
 def list_dicom(
     context: Context,
     principal: Reader,
@@ -106,7 +115,7 @@ def list_dicom(
     return listed(request, response, views, [view.id for view in views], limit)
 
 
-@router.post("", status_code=202, operation_id="dicom.send")
+@router.post("/dicom", status_code=202, operation_id="dicom.send")
 def send_dicom(
     context: Context, principal: Uploader, clouds: CloudsDep, cloud_id: CloudId, wanted: DicomRequest
 ) -> DicomSet:
@@ -125,6 +134,44 @@ def send_dicom(
         audit(session, principal.key_id, "dicom.request", cloud_id, set=row.id, again=wanted.again)
         (view,) = _views(session, [row])
     return view
+
+
+@router.get(
+    "/dicom.zip",
+    response_class=Response,
+    responses={200: {"content": {"application/zip": {}}}},
+    operation_id="dicom.get_archive",
+)
+async def get_archive(
+    context: Context, principal: Uploader, clouds: CloudsDep, making: MakingDep, request: Request, cloud_id: CloudId
+) -> StreamingResponse:
+    """Return the first set of DICOM objects as a ZIP with a DICOMDIR, made anew for each request.
+
+    It holds what the study context says of the patient, so nothing of it is kept.
+    """
+    await run_in_threadpool(clouds.record, cloud_id)
+    file = await making.run_while(request.receive, principal.key_id, lambda: _archive(context, principal, cloud_id))
+    headers = {
+        "Content-Length": str(os.fstat(file.fileno()).st_size),
+        "Content-Disposition": f'attachment; filename="{cloud_id}-dicom.zip"',
+        "Cache-Control": "no-store",
+    }
+    return StreamingResponse(_pieces(file), media_type="application/zip", headers=headers)
+
+
+def _archive(context: AppContext, principal: Principal, cloud_id: str) -> BinaryIO:
+    """Make the archive; open, and removed already, so that it goes with whoever reads it."""
+    with workspace(context.settings.scratch) as folder:
+        make_objects(context.database, context.storage, context.settings, cloud_id, {}, folder, archive=ARCHIVE)
+        with context.database.session() as session:
+            audit(session, principal.key_id, "dicom.download", cloud_id)
+        return open(folder / "objects" / ARCHIVE, "rb")
+
+
+def _pieces(file: BinaryIO) -> Iterator[bytes]:
+    with file:
+        while piece := file.read(1 << 18):
+            yield piece
 
 
 def _views(session: Session, rows: list[tables.DicomSet]) -> list[DicomSet]:
