@@ -25,6 +25,7 @@ pytest_plugins = (
     "tests.support.json_line_scene",
     "tests.support.webhook_receiver",
     "tests.support.browser_scene",
+    "tests.support.orthanc",
 )
 
 TEST_DATA_VARIABLE = "SPECIMAP_TEST_DATA"

@@ -43,6 +43,7 @@ FEATURE_IMPORTS = {
     "jobs": {"auth", "clouds"},  # deleting a job closes its clouds
     "acquisitions": {"auth", "jobs", "clouds"},  # deleting an acquisition removes its jobs' results
     "uploads": {"auth", "acquisitions"},  # an upload becomes a file of an acquisition
+    "hospital": {"auth", "acquisitions", "clouds"},  # an order belongs to an acquisition, DICOM objects to a result
     # The description of the API.
     "contract": {"auth", "jobs", "uploads"},
 }

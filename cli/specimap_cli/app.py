@@ -12,6 +12,7 @@ import typer
 
 from specimap_cli import run_options
 from specimap_cli.backup import backup, restore
+from specimap_cli.contexts import contexts_app
 from specimap_cli.doctor import doctor
 from specimap_cli.errors import Debug, reported_errors, stoppable
 from specimap_cli.keys import keys_app
@@ -181,6 +182,15 @@ def worker(
 
 
 @app.command()
+def hospital(debug: Debug = False) -> None:
+    """Send results to the archive and listen to the DICOM port, until Ctrl-C; `specimap serve` does it by itself."""
+    with reported_errors(progress_listener(), debug):
+        from specimap_cli.serve import run_hospital
+
+        run_hospital()
+
+
+@app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for the results and the demo's service.")] = Path("out/demo"),
     samples: Annotated[Path, typer.Option(help="Folder of the sample that comes with the source.")] = Path("samples"),
@@ -222,5 +232,6 @@ app.command()(backup)
 app.command()(restore)
 app.add_typer(study_app, name="study")
 app.add_typer(keys_app, name="keys")
+app.add_typer(contexts_app, name="contexts")
 app.add_typer(projects_app, name="projects")
 app.add_typer(storage_app, name="storage")

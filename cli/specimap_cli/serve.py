@@ -11,6 +11,7 @@ import sqlalchemy as sa
 
 from specimap_core.errors import SettingsError
 from specimap_core.sandbox import hide_from_others
+from specimap_hospital.connections import check_has_work
 from specimap_infra.confinement import check_confinement
 from specimap_infra.database import Database
 from specimap_infra.logs import set_up_logs
@@ -22,6 +23,8 @@ from specimap_infra.tables import SCOPES, ApiKey
 from specimap_workers.reaper import burier
 from specimap_workers.supervisor import Supervisor
 
+HOSPITAL = "specimap_hospital"
+"""The module whose process is the hospital's side."""
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
@@ -54,7 +57,10 @@ def serve(*, workers: bool, say: Callable[[str], None]) -> None:
     url = settings.public_url or f"http://{f'[{host}]' if ':' in host else host}:{port}"
     if settings.host not in LOOPBACK:
         say(f"Listening on {settings.host}: put a TLS proxy in front, since keys travel with every request.")
-    supervisor = Supervisor(settings.slots if workers else 0, bury=burier(settings))
+    supervisors = [
+        Supervisor(settings.slots if workers else 0, bury=burier(settings)),
+        Supervisor(1 if settings.has_hospital_process else 0, module=HOSPITAL),
+    ]
 
     class Server(uvicorn.Server):
         async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -69,11 +75,13 @@ def serve(*, workers: bool, say: Callable[[str], None]) -> None:
     # The server raises the signal that stopped it again at its end, when the workers have still to be stopped.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: None)
-    supervisor.start()
+    for supervisor in supervisors:
+        supervisor.start()
     try:
         Server(server_config(app, settings)).run(sockets=[listener])
     finally:
-        supervisor.stop()
+        for supervisor in supervisors:
+            supervisor.stop()
 
 
 def work(*, slots: int | None, kind: str) -> None:
@@ -92,8 +100,31 @@ def work(*, slots: int | None, kind: str) -> None:
         Storage.open(settings).check_at_start()
     finally:
         database.close()
-    supervisor = Supervisor(slots or settings.slots, ("--kind", kind), burier(settings))
+    _run_until_stopped(Supervisor(slots or settings.slots, ("--kind", kind), burier(settings)))
 
+
+def run_hospital() -> None:
+    """Run the process of the hospital's side until SIGINT or SIGTERM.
+
+    Raises:
+        SettingsError: there is nothing for it to do.
+        DatabaseUnavailableError, StorageUnavailableError: before anything was started.
+    """
+    settings = load_settings()
+    set_up_logs(settings)
+    check_confinement(settings)
+    hide_from_others()
+    check_has_work(settings)
+    database = Database.open(settings.database)
+    try:
+        migrate(database)
+        Storage.open(settings).check_at_start()
+    finally:
+        database.close()
+    _run_until_stopped(Supervisor(1, module=HOSPITAL))
+
+
+def _run_until_stopped(supervisor: Supervisor) -> None:
     def stop(number: int, _: object) -> None:
         raise KeyboardInterrupt
 

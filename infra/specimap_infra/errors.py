@@ -63,3 +63,45 @@ class RestoreTargetError(SpecimapError, FileExistsError):
     """A backup would be restored over data."""
 
     code = "restore_target_not_empty"
+
+
+class StudyKeysMissingError(SpecimapError, RuntimeError):
+    """No key to encrypt study contexts with is set, so none is kept."""
+
+    code = "study_keys_missing"
+
+
+class StudySealedError(SpecimapError, RuntimeError):
+    """A study context does not open: its key is no longer set, or its row was changed."""
+
+    code = "study_sealed"
+
+
+class StudyMissingError(SpecimapError, ValueError):
+    """The acquisition has no study context, which DICOM objects of its results need."""
+
+    code = "study_missing"
+
+
+class OrderSourceMissingError(SpecimapError, ValueError):
+    """No worklist and no other source of orders is set."""
+
+    code = "order_source_missing"
+
+
+class OrderSourceUnavailableError(SpecimapError, RuntimeError):
+    """The source of orders does not answer, refuses, or answers what does not read; ``details['source']`` names it."""
+
+    code = "order_source_unavailable"
+
+
+class FhirServerMissingError(SpecimapError, ValueError):
+    """A result is to be told to a FHIR server, and none is set."""
+
+    code = "fhir_server_missing"
+
+
+class ArchiveMissingError(SpecimapError, ValueError):
+    """No archive to send DICOM objects to is set."""
+
+    code = "archive_missing"

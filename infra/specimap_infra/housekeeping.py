@@ -33,6 +33,8 @@ from specimap_infra.tables import (
     AuditEntry,
     CloudRow,
     Delivery,
+    DicomInstance,
+    DicomSet,
     Export,
     Job,
     JobEvent,
@@ -50,7 +52,7 @@ EVERY_SECONDS = 3600.0
 STOP_SECONDS = 3.0
 LEFTOVER_SECONDS = 24 * 3600.0
 """Age from which a file aside belongs to a process that was killed; none works on one for as long."""
-LEFTOVER = re.compile(r"^(?:[0-9a-f]{32}|label-[0-9a-f]{32}(?:\.body)?|exp_[\w-]+|restore-[0-9a-f]{32})\.tmp$")
+LEFTOVER = re.compile(r"^(?:(?:dicom-)?[0-9a-f]{32}|label-[0-9a-f]{32}(?:\.body)?|exp_[\w-]+|restore-[0-9a-f]{32})\.tmp$")
 """Names that our programs give in the scratch folder, which may be shared with others."""
 AUDITED_AS = "service"
 REQUEST_DAYS = 7.0
@@ -101,6 +103,7 @@ class Housekeeping:
             "uploads": (s.keep_upload_days, self._uploads),
             "deliveries": (s.keep_delivery_days, self._deliveries),
             "audit": (s.keep_audit_days, self._audit),
+            "dicom": (s.keep_dicom_days, self._dicom),
             "requests": (REQUEST_DAYS, self._requests),
             "sessions": (SESSION_DAYS, self._sessions),
         }
@@ -169,6 +172,11 @@ class Housekeeping:
 
     def _deliveries(self, before: datetime.datetime) -> int:
         return self._rows(Delivery.id, sa.and_(Delivery.state != "pending", Delivery.next_at < before))
+
+    def _dicom(self, before: datetime.datetime) -> int:
+        """States of objects whose set has ended. The set stays, so that it is not sent again."""
+        ended = sa.select(DicomSet.id).where(DicomSet.settled_at < before)
+        return self._rows(DicomInstance.id, DicomInstance.set_id.in_(ended))
 
     def _audit(self, before: datetime.datetime) -> int:
         return self._rows(AuditEntry.id, AuditEntry.at < before)
@@ -261,6 +269,7 @@ def count_rows(session: Session) -> dict[str, int]:
         "artefacts": Artefact.__table__,
         "audit": AuditEntry.__table__,
         "deliveries": Delivery.__table__,
+        "dicom": DicomInstance.__table__,
         "events": JobEvent.__table__,
         "exports": Export.__table__,
         "labels": LabelVersion.__table__,

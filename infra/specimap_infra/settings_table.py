@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
+from pydantic import SecretStr
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
@@ -47,7 +48,7 @@ def _default(name: str, field: FieldInfo) -> str:
     value = field.get_default(call_default_factory=True, validated_data={})
     if value is PydanticUndefined:
         raise TypeError(f"{name} has no default")
-    if value in ("", None):
+    if value in ("", None) or (isinstance(value, SecretStr) and not value.get_secret_value()):
         return ""
     if name.endswith("_bytes"):
         for unit, size in (("GiB", GIB), ("MiB", MIB)):
@@ -64,8 +65,8 @@ def _takes(name: str, field: FieldInfo) -> str:
         return "a folder"
     if kind == list[str]:
         return "a JSON list of text"
-    if kind is str:
-        return "text"
+    if kind in (str, SecretStr):
+        return "text" if kind is str else "text, a secret"
     noun = {int: "whole number", float: "number"}[kind]
     limits = [f"{word} {value}" for word, value in _limits(field)]
     return ", ".join([noun, *limits])

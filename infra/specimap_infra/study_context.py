@@ -7,9 +7,10 @@ array.
 from __future__ import annotations
 
 import datetime
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
+from pydantic_core import PydanticCustomError
 
 _NO_CONTROL = r"^[^\x00-\x1f\x7f\\]*$"
 ShortText = Annotated[str, StringConstraints(strip_whitespace=True, max_length=16, pattern=_NO_CONTROL)]
@@ -45,3 +46,11 @@ class StudyContext(BaseModel):
     issuer_of_specimen_identifier: Text = ""
     specimen_uid: Uid | None = None
     specimen_description: Text = ""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_fields(cls, values: Any) -> Any:
+        # The name of a field that is none would stand in the error, and it may be a patient's.
+        if isinstance(values, dict) and not values.keys() <= cls.model_fields.keys():
+            raise PydanticCustomError("unknown_field", "It has a field that a study context does not have")
+        return values

@@ -35,6 +35,8 @@ from specimap_service.compression import Compression
 from specimap_service.context import CONTEXT, AppContext
 from specimap_service.contract.description import describe
 from specimap_service.head_requests import HeadRequests
+from specimap_service.hospital import dependencies as hospital
+from specimap_service.hospital import dicom_routes, fhir_routes, order_routes, study_routes
 from specimap_service.jobs import delivery_routes
 from specimap_service.jobs import dependencies as jobs
 from specimap_service.jobs import routes as job_routes
@@ -54,7 +56,7 @@ a person signs in with one instead. Errors are
 operation does not know is refused. Within `/v1` the contract only grows.
 """
 
-FEATURES = (auth.FEATURE, acquisitions.FEATURE, uploads.FEATURE, jobs.FEATURE, clouds.FEATURE)
+FEATURES = (auth.FEATURE, acquisitions.FEATURE, uploads.FEATURE, jobs.FEATURE, clouds.FEATURE, hospital.FEATURE)
 """Opened in this order, closed in the reverse one: uploads use the judge of acquisitions."""
 ROUTES = (
     health,
@@ -75,6 +77,10 @@ ROUTES = (
     label_routes,
     export_routes,
     share_routes,
+    study_routes,
+    order_routes,
+    dicom_routes,
+    fhir_routes,
 )
 """Modules with a ``router``, in the order of the API's description."""
 

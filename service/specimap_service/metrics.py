@@ -15,7 +15,19 @@ from specimap_infra.errors import DatabaseUnavailableError, StorageUnavailableEr
 from specimap_infra.housekeeping import count_rows, scratch_bytes
 from specimap_infra.settings import ServiceSettings
 from specimap_infra.storage import Storage
-from specimap_infra.tables import JOB_STATES, Artefact, CloudRow, Export, Job, LabelVersion, Lease, StoredFile
+from specimap_infra.tables import (
+    DICOM_STATES,
+    JOB_STATES,
+    Artefact,
+    CloudRow,
+    DicomInstance,
+    DicomSet,
+    Export,
+    Job,
+    LabelVersion,
+    Lease,
+    StoredFile,
+)
 
 REQUEST_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 60)
 COUNTED_SECONDS = 60.0
@@ -67,6 +79,7 @@ class _FromDatabase(Collector):
         try:
             yield from self._jobs()
             yield from self._stored()
+            yield from self._outbox()
             yield from self._kept()
         except DatabaseUnavailableError:
             return
@@ -122,6 +135,25 @@ class _FromDatabase(Collector):
             free = None
         if free is not None:
             yield GaugeMetricFamily("specimap_storage_free_bytes", "Free space of the storage.", value=float(free))
+
+    def _outbox(self) -> Iterator[GaugeMetricFamily]:
+        with self._database.session() as session:
+            by_state = session.execute(sa.select(DicomInstance.state, sa.func.count()).group_by(DicomInstance.state))
+            counts = {row[0]: int(row[1]) for row in by_state}
+            oldest = session.scalar(sa.select(sa.func.min(DicomSet.created_at)).where(DicomSet.state == "waiting"))
+            sets = session.execute(sa.select(DicomSet.state, sa.func.count()).group_by(DicomSet.state))
+            by_set = {row[0]: int(row[1]) for row in sets}
+        objects = GaugeMetricFamily("specimap_dicom_objects", "DICOM objects by state.", labels=("state",))
+        results = GaugeMetricFamily("specimap_dicom_sets", "Sets of DICOM objects by state.", labels=("state",))
+        for state in DICOM_STATES:
+            objects.add_metric((state,), counts.get(state, 0))
+            results.add_metric((state,), by_set.get(state, 0))
+        yield objects
+        yield results
+        age = (utc_now() - oldest).total_seconds() if oldest else 0.0
+        yield GaugeMetricFamily(
+            "specimap_dicom_wait_seconds", "Age of the oldest set of DICOM objects that waits.", value=max(age, 0.0)
+        )
 
     def _kept(self) -> Iterator[GaugeMetricFamily]:
         if self._counted is None or time.monotonic() - self._counted_at > COUNTED_SECONDS:

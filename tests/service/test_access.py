@@ -15,6 +15,7 @@ from fastapi.dependencies.models import Dependant
 from fastapi.routing import iter_route_contexts
 
 from specimap_infra.database import Database
+from specimap_infra.study_keys import new_key
 from specimap_infra.tables import Base
 from specimap_service.auth.dependencies import known_principal
 from specimap_service.auth.object_ids import GUARDS
@@ -30,7 +31,8 @@ NO_KEY = {("GET", "/healthz"), ("GET", "/readyz"), ("POST", "/v1/session")}
 
 @pytest.fixture
 def any_service(any_database: str, tmp_path: Path) -> Iterator[Running]:
-    with serving(tmp_path / "service", database_url=any_database) as running:
+    hospital = {"study_keys": [new_key()], "pacs_url": "http://127.0.0.1:9", "fhir_url": "http://127.0.0.1:9"}
+    with serving(tmp_path / "service", database_url=any_database, **hospital) as running:
         yield running
 
 

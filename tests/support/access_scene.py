@@ -95,6 +95,9 @@ def make_world(service: Running, folder: Path, project: str, uploader: httpx.Cli
         )
         session.add(share)
         share_id = share.id
+    if service.settings.study_keys:
+        given = uploader.put(f"/v1/acquisitions/{owner}/study", json={"patient_id": "1"})
+        assert given.status_code == 200, given.text
     upload = created(uploader, owner, "photo", 3).rpartition("/")[2]
     return World(
         {
@@ -253,10 +256,20 @@ CASES: dict[tuple[str, str], Case] = {
     ("HEAD", f"{EXPORT}/content"): _read(),
     ("GET", f"{CLOUD}/shares"): Case("upload", aims=True),
     ("POST", f"{CLOUD}/shares"): Case("upload", 201, _share, aims=True, also=("read",)),
+    # the hospital's side, where no worklist is set
+    ("PUT", f"{ACQUISITION}/study"): Case("upload", 200, _json(patient_id="1"), aims=True),
+    ("GET", f"{ACQUISITION}/study"): Case("upload", aims=True),
+    ("POST", "/v1/orders/search"): Case("upload", 409, _json(accession_number="1")),
+    ("GET", f"{CLOUD}/dicom"): _read(),
+    ("GET", f"{CLOUD}/dicom.zip"): Case("upload", aims=True),
+    ("POST", f"{CLOUD}/dicom"): Case("upload", 202, _json(), aims=True),
+    ("POST", f"{CLOUD}/fhir"): Case("upload", 202, aims=True),
+    ("GET", f"{CLOUD}/fhir"): _read(),
     # what ends something: each after all that needs it
     ("DELETE", "/v1/uploads/{uuid}"): Case("upload", 204, _tus(), aims=True),
     ("DELETE", f"{CLOUD}/shares/{{share_id}}"): Case("upload", 204, aims=True),
     ("DELETE", LABEL): Case("label", 204, aims=True),
+    ("DELETE", f"{ACQUISITION}/study"): Case("upload", 204, aims=True),
     ("POST", f"{JOB}/cancel"): Case("upload", 202, aims=True, spare=True),
     ("DELETE", f"{ACQUISITION}{FILE}"): Case("upload", 204, aims=True, spare=True),
     ("DELETE", JOB): Case("admin", 204, aims=True),

@@ -31,13 +31,21 @@ class Supervisor:
     file of settings under repair) may pass, and a service without a worker looks sound while no job gets on.
     """
 
-    def __init__(self, slots: int, options: Sequence[str] = (), bury: Callable[[str, bool], None] = _nobody) -> None:
-        """``bury`` is called with the name of each worker that has ended, and whether that was a death.
+    def __init__(
+        self,
+        slots: int,
+        options: Sequence[str] = (),
+        bury: Callable[[str, bool], None] = _nobody,
+        module: str = "specimap_workers",
+    ) -> None:
+        """``module``: what a child runs. ``bury`` is called with the name of each worker that has ended, and whether
+        that was a death.
 
         It hands over what the worker held at once; where it fails, leases and notes do so later.
         """
         self._options = tuple(options)
         self._bury = bury
+        self._module = module
         self._stopping = threading.Event()
         self._lock = threading.Lock()
         self._children: dict[int, tuple[str, subprocess.Popen[bytes]]] = {}
@@ -76,7 +84,7 @@ class Supervisor:
         pause = FIRST_PAUSE
         while not self._stopping.is_set():
             started, executor = time.monotonic(), new_executor(slot)
-            command = [sys.executable, "-m", "specimap_workers", "--slot", str(slot), *self._options]
+            command = [sys.executable, "-m", self._module, "--slot", str(slot), *self._options]
             command += ["--parent", str(os.getpid()), "--executor", executor]
             with self._lock:
                 if self._stopping.is_set():

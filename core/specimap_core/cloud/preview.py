@@ -15,6 +15,7 @@ from specimap_core.cloud import CHUNK_POINTS, Cloud, Flag
 from specimap_core.cloud.top_view import TopView, extent_mm, top_view
 
 COLOURS = 3
+GRID_MM = 0.1
 STRETCH_PERCENT = (2.0, 98.0)
 FILL_CELLS = 2.0
 """A cell without points takes the colour of the nearest that has, if that is at most this far."""
@@ -101,17 +102,21 @@ def _fill_missing(
     return np.asarray(few <= _MOST_HOLES * max(int(used.sum()), 1))
 
 
-def write_preview(cloud: Cloud, path: Path, grid_mm: float = 0.1) -> None:
+def preview_grid_mm(cloud: Cloud, grid_mm: float = GRID_MM) -> float:
+    """Cell of the preview: ``grid_mm``, or coarser where the picture would exceed 4096 pixels a side."""
+    x_min, y_min, x_max, y_max = extent_mm(cloud)
+    least = max(x_max - x_min, y_max - y_min) / (MOST_PIXELS_A_SIDE - 1)
+    return max(grid_mm, least) if grid_mm > 0 else grid_mm
+
+
+def write_preview(cloud: Cloud, path: Path, grid_mm: float = GRID_MM) -> None:
     """Write the top view as a PNG with transparency where there is nothing: x to the right, y up.
 
     A pixel is a cell of ``grid_mm`` (coarser where the picture would exceed 4096 pixels a side), coloured by the
     mean of its topmost points. Raises SettingsError for a grid that is not positive, StorageFullError,
     OutputNotWritableError, CloudDamagedError.
     """
-    x_min, y_min, x_max, y_max = extent_mm(cloud)
-    if grid_mm > 0:
-        grid_mm = max(grid_mm, max(x_max - x_min, y_max - y_min) / (MOST_PIXELS_A_SIDE - 1))
-    view = top_view(cloud, grid_mm)
+    view = top_view(cloud, preview_grid_mm(cloud, grid_mm))
     components = pca_colours(sampled_spectra(cloud), cloud.bad_bands)
     colours = np.empty((cloud.n_points, COLOURS), np.float32)
     shown = np.ones(cloud.n_points, bool)
@@ -120,7 +125,7 @@ def write_preview(cloud: Cloud, path: Path, grid_mm: float = 0.1) -> None:
         if cloud.fill_value is not None:
             shown[part] = _fill_missing(colours[part], spectra, components, cloud.fill_value)
     np.clip(colours, 0, 1, out=colours)
-    image = _picture(view, colours, shown)
+    image = view_picture(view, 255 * colours, shown)
     done, png = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA), [cv2.IMWRITE_PNG_COMPRESSION, 3])
     if not done:
         raise RuntimeError("OpenCV could not encode a PNG")
@@ -128,28 +133,32 @@ def write_preview(cloud: Cloud, path: Path, grid_mm: float = 0.1) -> None:
         aside.write_bytes(png.data)
 
 
-def _picture(view: TopView, colours: NDArray[np.float32], shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """RGBA (rows, cols, 4) with y up: the mean colour of each cell's topmost points, small holes filled."""
-    top = view.top & shown
+def view_picture(view: TopView, colours: Array, shown: NDArray[np.bool_] | None = None) -> NDArray[np.uint8]:
+    """RGBA (rows, cols, 4) with y up: mean of the colours (S, 3), 0..255, of each cell's topmost points, small holes
+    filled; points that are not ``shown`` (S,) do not count."""
+    top = view.top if shown is None else view.top & shown
     cell, size = view.cell[top], view.rows * view.cols
     count = np.bincount(cell, minlength=size)
     image = np.zeros((size, 4), np.uint8)
     for i in range(COLOURS):
         total = np.bincount(cell, weights=colours[top, i], minlength=size)
-        image[:, i] = np.rint(255 * total / np.maximum(count, 1))
+        image[:, i] = np.rint(total / np.maximum(count, 1))
     image[:, 3] = np.where(count > 0, 255, 0)
-    filled = _fill(image.reshape(view.rows, view.cols, 4))
+    source = nearest_covered((count > 0).reshape(view.rows, view.cols))
+    filled = np.where(source[..., None] >= 0, image[source], 0)
     return np.ascontiguousarray(filled[::-1])
 
 
-def _fill(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    empty = (image[..., 3] == 0).astype(np.uint8)
-    if not empty.any():
-        return image
+def nearest_covered(covered: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """The cell (rows, cols), row-major, whose value each cell takes: its own where it is covered, else that of the
+    nearest that is, if that is at most :data:`FILL_CELLS` away, else -1."""
+    source = np.where(covered, np.arange(covered.size).reshape(covered.shape), -1)
+    if covered.all() or not covered.any():
+        return source
+    empty = (~covered).astype(np.uint8)
     distance, nearest = cv2.distanceTransformWithLabels(empty, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    covered = empty == 0
-    colour_of = np.zeros((int(nearest.max()) + 1, 4), np.uint8)
-    colour_of[nearest[covered]] = image[covered]
+    cell_of = np.zeros(int(nearest.max()) + 1, np.intp)
+    cell_of[nearest[covered]] = source[covered]
     near = (distance > 0) & (distance <= FILL_CELLS)
-    image[near] = colour_of[nearest[near]]
-    return image
+    source[near] = cell_of[nearest[near]]
+    return source

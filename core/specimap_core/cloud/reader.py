@@ -71,8 +71,15 @@ class Cloud(CloudArrays):
 
     def band(self, band: int) -> NDArray[np.float32]:
         """Decoded values (S,) of one band. Raises NotFoundError, CloudDamagedError."""
-        chosen = int(self._inside([band], self.bands, "band")[0])
-        out = np.empty(self.n_points, np.uint16)
+        return self.band_values([band])[:, 0]
+
+    def band_values(self, bands: Sequence[int]) -> NDArray[np.float32]:
+        """Decoded values (S, n) of some bands, NaN where there is none, in one pass over the cloud.
+
+        Raises NotFoundError, CloudDamagedError.
+        """
+        chosen = self._inside(bands, self.bands, "band")
+        out = np.empty((self.n_points, len(chosen)), np.uint16)
         for first, block in self._spectra.blocks(4096):
             out[first : first + len(block)] = block[:, chosen]
         return self.decode(out)

@@ -10,6 +10,8 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 
 from specimap_core.errors import SettingsError
 from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES, backends_from
+from specimap_infra.settings.fhir import FhirSettings
+from specimap_infra.settings.hospital import HospitalSettings
 from specimap_infra.settings.logging import LogSettings
 from specimap_infra.settings.places import PlaceSettings
 from specimap_infra.settings.retention import RetentionSettings
@@ -30,7 +32,9 @@ def _config_file() -> Path | None:
 class ServiceSettings(
     # The last one's fields come first.
     LogSettings,
+    HospitalSettings,
     RetentionSettings,
+    FhirSettings,
     WebhookSettings,
     WorkerSettings,
     UploadSettings,
@@ -72,6 +76,11 @@ class ServiceSettings(
     def scratch(self) -> Path:
         """Folder for what is under way; on a local disk."""
         return self.scratch_dir or self.data_dir / "scratch"
+
+    @property
+    def has_hospital_process(self) -> bool:
+        """Whether a process of the hospital's side has work."""
+        return self.sends_dicom or bool(self.dicom_port or self.fhir_url)
 
     @property
     def private_places(self) -> list[Path]:

@@ -6,10 +6,13 @@ from specimap_infra.tables.access import ApiKey, AuditEntry, Project, Share, Sig
 from specimap_infra.tables.acquisitions import Acquisition, StoredFile, Upload, UploadPart
 from specimap_infra.tables.base import Base, UtcDateTime
 from specimap_infra.tables.clouds import CloudRow, Export, LabelVersion
+from specimap_infra.tables.fhir import FhirNotice
+from specimap_infra.tables.hospital import DicomInstance, DicomSet, SealedStudy
 from specimap_infra.tables.jobs import Artefact, Delivery, Job, JobEvent, Lease, RepeatableRequest
-from specimap_infra.tables.names import FINAL_STATES, JOB_STATES, PRIORITIES, QUEUED, ROLES, SCOPES
+from specimap_infra.tables.names import DICOM_STATES, FINAL_STATES, JOB_STATES, PRIORITIES, QUEUED, ROLES, SCOPES
 
 __all__ = [
+    "DICOM_STATES",
     "FINAL_STATES",
     "JOB_STATES",
     "PRIORITIES",
@@ -23,13 +26,17 @@ __all__ = [
     "Base",
     "CloudRow",
     "Delivery",
+    "DicomInstance",
+    "DicomSet",
     "Export",
+    "FhirNotice",
     "Job",
     "JobEvent",
     "LabelVersion",
     "Lease",
     "Project",
     "RepeatableRequest",
+    "SealedStudy",
     "Share",
     "SignIn",
     "StoredFile",

@@ -6,6 +6,7 @@ import sqlalchemy as sa
 
 JOB_STATES = ("queued", "running", "succeeded", "failed", "cancelled")
 FINAL_STATES = ("succeeded", "failed", "cancelled")
+DICOM_STATES = ("waiting", "sent", "committed", "failed")
 PRIORITIES = {"intraoperative": 1, "routine": 5, "research": 9}
 SCOPES = ("upload", "read", "label", "intraoperative", "admin")
 ROLES = ("photo", "cube", "white", "dark")

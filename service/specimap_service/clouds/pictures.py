@@ -26,7 +26,6 @@ COLOUR_MAP = "viridis"
 DIM = 0.35
 """Brightness of the grey photos under a label's colour, and where a point has no label."""
 BAND = re.compile(r"^(?:(\d{1,5})|(\d{1,5}(?:\.\d{1,4})?)nm)$")
-_BLOCK = 4096
 _PITCH_CELLS = 1.5
 # Noise hardly compresses better at a higher level, which takes three times as long.
 _COMPRESSION = 2
@@ -84,14 +83,6 @@ def band_index(cloud: Cloud, given: str) -> int:
     return int(np.abs(known - wanted).argmin())
 
 
-def read_bands(cloud: Cloud, bands: list[int]) -> NDArray[np.float32]:
-    """Read decoded values (S, n) of some bands, NaN where there is none, in one pass over the cloud."""
-    stored = np.empty((cloud.n_points, len(bands)), np.uint16)
-    for part, block in cloud.iter_chunks(_BLOCK):
-        stored[part] = block[:, bands]
-    return cloud.decode(stored)
-
-
 def paint_rgb(cloud: Cloud) -> PointColours:
     """Colour points as the photos do."""
     return PointColours(cloud.rgb)
@@ -99,21 +90,21 @@ def paint_rgb(cloud: Cloud) -> PointColours:
 
 def paint_band(cloud: Cloud, band: int, limits: tuple[float, float] | None) -> PointColours:
     """Show one band in grey, between ``limits`` or its own percentiles; points without a value are not shown."""
-    values = read_bands(cloud, [band])[:, 0]
+    values = cloud.band_values([band])[:, 0]
     limits = limits or _percentiles(values)
     return PointColours(_levels(values, limits), _known(values), limits)
 
 
 def paint_composite(cloud: Cloud, bands: tuple[int, int, int]) -> PointColours:
     """Show three bands as red, green and blue, each between its own percentiles; points that lack one are not shown."""
-    values = read_bands(cloud, list(bands))
+    values = cloud.band_values(list(bands))
     channels = [_levels(values[:, i], _percentiles(values[:, i])) for i in range(3)]
     return PointColours(np.stack(channels, 1), _known(values.sum(1)))
 
 
 def paint_index(cloud: Cloud, a: int, b: int, limits: tuple[float, float] | None) -> PointColours:
     """Show (a - b) / (a + b) of two bands as a colour scale; points where a + b is not positive are not shown."""
-    values = read_bands(cloud, [a, b]).astype(np.float64)
+    values = cloud.band_values([a, b]).astype(np.float64)
     total = values.sum(1)
     shown = total > 0  # False for NaN, too
     index = np.divide(values[:, 0] - values[:, 1], total, out=np.zeros(len(total)), where=shown)

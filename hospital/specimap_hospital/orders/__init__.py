@@ -1,0 +1,1 @@
+"""Orders of the hospital, looked up by accession number, patient or station."""

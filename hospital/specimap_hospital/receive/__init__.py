@@ -1,0 +1,1 @@
+"""DICOM objects that come in: classifiers' segmentations, photos, an archive's commitment."""

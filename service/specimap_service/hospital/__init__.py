@@ -1,0 +1,1 @@
+"""What joins the API to a hospital: study contexts, orders, DICOM objects out and in."""
