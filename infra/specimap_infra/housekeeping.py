@@ -40,6 +40,7 @@ from specimap_infra.tables import (
     Lease,
     RepeatableRequest,
     SignIn,
+    SignInAttempt,
     Upload,
 )
 
@@ -103,6 +104,7 @@ class Housekeeping:
             "audit": (s.keep_audit_days, self._audit),
             "requests": (REQUEST_DAYS, self._requests),
             "sessions": (SESSION_DAYS, self._sessions),
+            "attempts": (SESSION_DAYS, self._attempts),
         }
         removed = dict.fromkeys([*rules, "leftovers"], 0)
         for name, (days, batch) in rules.items():
@@ -184,6 +186,9 @@ class Housekeeping:
     def _sessions(self, before: datetime.datetime) -> int:
         return self._rows(SignIn.id, SignIn.expires_at < before)
 
+    def _attempts(self, before: datetime.datetime) -> int:
+        return self._rows(SignInAttempt.id, SignInAttempt.expires_at < before)
+
     def _rows(self, id: InstrumentedAttribute[str] | InstrumentedAttribute[int], rule: sa.ColumnElement[bool]) -> int:
         with self._database.session() as session:
             some = sa.select(id).where(rule).limit(BATCH)
@@ -259,6 +264,7 @@ def count_rows(session: Session) -> dict[str, int]:
     """Count the rows of what is kept by rule, and of leases."""
     tables: dict[str, sa.FromClause] = {
         "artefacts": Artefact.__table__,
+        "attempts": SignInAttempt.__table__,
         "audit": AuditEntry.__table__,
         "deliveries": Delivery.__table__,
         "events": JobEvent.__table__,

@@ -7,8 +7,8 @@ from typing import Literal
 
 from ulid import ULID
 
-Kind = Literal["acq", "file", "up", "job", "cloud", "key", "exp", "evt", "att", "dlv", "prj", "shr"]
-PATTERN = re.compile(r"^[a-z]{2,5}_[0-9a-hjkmnp-tv-z]{26}$")
+Kind = Literal["acq", "file", "up", "job", "cloud", "key", "exp", "evt", "att", "dlv", "prj", "shr", "person"]
+PATTERN = re.compile(r"^[a-z]{2,6}_[0-9a-hjkmnp-tv-z]{26}$")
 
 
 def new_id(kind: Kind) -> str:

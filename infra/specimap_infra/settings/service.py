@@ -10,6 +10,7 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 
 from specimap_core.errors import SettingsError
 from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES, backends_from
+from specimap_infra.settings.identity import IdentitySettings
 from specimap_infra.settings.logging import LogSettings
 from specimap_infra.settings.places import PlaceSettings
 from specimap_infra.settings.retention import RetentionSettings
@@ -34,6 +35,7 @@ class ServiceSettings(
     WebhookSettings,
     WorkerSettings,
     UploadSettings,
+    IdentitySettings,
     ServerSettings,
     PlaceSettings,
     BaseSettings,

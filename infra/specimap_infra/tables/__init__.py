@@ -8,6 +8,7 @@ from specimap_infra.tables.base import Base, UtcDateTime
 from specimap_infra.tables.clouds import CloudRow, Export, LabelVersion
 from specimap_infra.tables.jobs import Artefact, Delivery, Job, JobEvent, Lease, RepeatableRequest
 from specimap_infra.tables.names import FINAL_STATES, JOB_STATES, PRIORITIES, QUEUED, ROLES, SCOPES
+from specimap_infra.tables.people import Person, SignInAttempt
 
 __all__ = [
     "FINAL_STATES",
@@ -28,10 +29,12 @@ __all__ = [
     "JobEvent",
     "LabelVersion",
     "Lease",
+    "Person",
     "Project",
     "RepeatableRequest",
     "Share",
     "SignIn",
+    "SignInAttempt",
     "StoredFile",
     "Upload",
     "UploadPart",
