@@ -13,7 +13,7 @@ from fastapi.routing import APIRoute
 from specimap_service.errors import RequestInvalidError
 from specimap_service.uploads.tus_routes import NOT_SERVED
 
-OPEN = ("sso.finish",)
+OPEN = ("sso.get_callback",)
 """Operations to which another program sends a browser, with parameters of its own."""
 
 

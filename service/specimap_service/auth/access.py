@@ -19,7 +19,7 @@ from specimap_infra.database import Database
 from specimap_infra.projects import named, no_project, project_of, within
 from specimap_infra.tables import AuditEntry, Base, CloudRow, Project
 from specimap_service.auth.keys import Principal
-from specimap_service.auth.permissions import AUDIT
+from specimap_service.auth.permissions import AUDIT_ALL
 from specimap_service.errors import ForbiddenError, RequestInvalidError
 
 _MOST_KNOWN = 20_000
@@ -65,7 +65,7 @@ def in_sight(principal: Principal, table: type[Base], project: str | None = None
     """
     if principal.cloud_id is not None:
         return table.__table__.c.id == principal.cloud_id if table is CloudRow else sa.false()
-    sees_all = principal.is_admin or (table is AuditEntry and principal.may(AUDIT))
+    sees_all = principal.is_admin or (table is AuditEntry and principal.may(AUDIT_ALL))
     if project is None:
         return sa.true() if sees_all else within(table, principal.project_ids)
     wanted = sa.select(Project.id).where(named(project))

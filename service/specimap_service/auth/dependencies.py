@@ -200,4 +200,7 @@ def check_permission(principal: Principal, permission: str) -> None:
 
 Permitted = Annotated[Principal, Depends(permitted)]
 """The principal of a request that the table of permissions permits."""
-Uploader = Reader = Labeller = Admin = Permitted
+Uploader = Permitted
+Reader = Permitted
+Labeller = Permitted
+Admin = Permitted

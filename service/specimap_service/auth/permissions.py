@@ -19,6 +19,7 @@ SHARE: Final = "share.manage"
 LABEL: Final = "label.write"
 DELETE: Final = "object.delete"
 AUDIT: Final = "audit.read"
+AUDIT_ALL: Final = "audit.all"
 KEYS: Final = "key.manage"
 PROJECTS: Final = "project.manage"
 WATCH: Final = "service.watch"
@@ -32,7 +33,8 @@ MEANINGS: dict[str, str] = {
     SHARE: "make, list and revoke links that show one result",
     LABEL: "write and delete label layers",
     DELETE: "delete acquisitions and jobs with all that belongs to them",
-    AUDIT: "read the audit trail, of all projects",
+    AUDIT: "read the audit trail",
+    AUDIT_ALL: "read the audit trail of all projects, and what is of none",
     KEYS: "create, list and revoke keys",
     PROJECTS: "create and rename projects",
     WATCH: "read the metrics",
@@ -46,7 +48,7 @@ ROLES: dict[str, frozenset[str]] = {
     "clinician": frozenset({READ, SHARE, LABEL}),
     "classifier": frozenset({READ, LABEL}),
     "admin": EVERYTHING,
-    "auditor": frozenset({AUDIT}),
+    "auditor": frozenset({AUDIT, AUDIT_ALL}),
 }
 """What a person of a role may."""
 
@@ -67,8 +69,8 @@ EQUIVALENT: dict[str, tuple[str, ...]] = {
     "admin": ("admin",),
     "auditor": ("audit",),
 }
-"""Scopes of a key for a program that does the work of a role. They differ in ``share.manage`` alone, which comes with
-``upload``."""
+"""Scopes of a key for a program that does the work of a role. They differ in what goes beyond: ``share.manage`` comes
+with ``upload``, and ``audit.all`` with ``admin`` alone."""
 
 OPERATIONS: dict[str, str | None] = {
     "acquisitions.create": CAPTURE,
@@ -131,7 +133,7 @@ OPERATIONS: dict[str, str | None] = {
     "spectra.get_band": READ,
     "spectra.get_point": READ,
     "spectra.select": READ,
-    "sso.logout": None,
+    "sso.end": None,
     "uploads.append": CAPTURE,
     "uploads.create": CAPTURE,
     "uploads.delete": CAPTURE,

@@ -148,8 +148,11 @@ def _ended() -> UnauthorizedError:
 
 def _holder(session: OrmSession, principal: Principal) -> ApiKey | Person | Share:
     """Return the one that asks. Raises UnauthorizedError where it has been deleted this moment."""
-    table = Share if principal.cloud_id is not None else Person if principal.is_person else ApiKey
-    found: ApiKey | Person | Share | None = session.get(table, principal.key_id)
+    found: ApiKey | Person | Share | None
+    if principal.cloud_id is not None:
+        found = session.get(Share, principal.key_id)
+    else:
+        found = session.get(Person if principal.is_person else ApiKey, principal.key_id)
     if found is None:
         raise _ended()
     return found

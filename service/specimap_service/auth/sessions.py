@@ -37,15 +37,16 @@ def new_session(
     """
     token, now = secrets.token_urlsafe(32), utc_now()
     key = holder if isinstance(holder, ApiKey) else None
-    ends = [now + datetime.timedelta(hours=hours), key and key.expires_at, share and share.expires_at]
+    ends = [now + datetime.timedelta(hours=hours)]
+    ends += [held.expires_at for held in (key, share) if held is not None and held.expires_at is not None]
     row = SignIn(
         id=session_id(token),
-        key_id=key and key.id,
+        key_id=None if key is None else key.id,
         person_id=None if key is not None else holder.id,
         granted=granted,
-        share_id=share and share.id,
+        share_id=None if share is None else share.id,
         created_at=now,
-        expires_at=min(end for end in ends if end is not None),
+        expires_at=min(ends),
     )
     session.add(row)
     session.flush()

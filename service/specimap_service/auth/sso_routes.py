@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from specimap_service.auth.oidc.identity import Identity
     from specimap_service.auth.oidc.sign_in import Finished
 
-router = APIRouter(prefix="/v1/sso", tags=["sessions"])
+router = APIRouter(prefix="/v1/sso", tags=["sso"])
 SIGN_INS_PER_MINUTE = 240
 """Begun and ended from one address, which may be a proxy's."""
 ATTEMPT_COOKIE = "specimap_sign_in"
@@ -57,7 +57,7 @@ def get_sso(context: Context) -> SsoOptions:
     return SsoOptions(enabled=bool(settings.oidc_issuer), name=settings.oidc_name)
 
 
-@router.get("/login", status_code=303, response_class=Response, operation_id="sso.begin")
+@router.get("/login", status_code=303, response_class=Response, operation_id="sso.get_login")
 def begin_sign_in(
     context: Context,
     request: Request,
@@ -81,7 +81,7 @@ def begin_sign_in(
     return answer
 
 
-@router.get("/callback", status_code=303, response_class=Response, operation_id="sso.finish")
+@router.get("/callback", status_code=303, response_class=Response, operation_id="sso.get_callback")
 def finish_sign_in(
     context: Context,
     request: Request,
@@ -118,7 +118,7 @@ def finish_sign_in(
     return answer
 
 
-@router.post("/logout", operation_id="sso.logout")
+@router.post("/logout", operation_id="sso.end")
 def sign_out(
     context: Context, principal: Known, keyring: KeyringDep, request: Request, response: Response
 ) -> SignedOut:

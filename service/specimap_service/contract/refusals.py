@@ -84,8 +84,8 @@ OWN: dict[str, tuple[Refusal, ...]] = {
     "spectra.get_band": (*_ARRAYS, *_TURNS),
     "spectra.get_point": _CLOUD,
     "spectra.select": (*_ARRAYS, *_TURNS),
-    "sso.begin": (service.SignInUnknownError, service.CrossSiteRequestError, service.RateLimitedError),
-    "sso.finish": (service.SignInUnknownError, service.RateLimitedError),
+    "sso.get_login": (service.SignInUnknownError, service.CrossSiteRequestError, service.RateLimitedError),
+    "sso.get_callback": (service.SignInUnknownError, service.RateLimitedError),
     "uploads.create": (
         (412, service.RequestInvalidError),
         core.NotFoundError,
