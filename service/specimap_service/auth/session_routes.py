@@ -152,7 +152,7 @@ def _holder(session: OrmSession, principal: Principal) -> ApiKey | Person | Shar
     if principal.cloud_id is not None:
         found = session.get(Share, principal.key_id)
     else:
-        found = session.get(Person if principal.is_person else ApiKey, principal.key_id)
+        found = session.get(Person, principal.key_id) if principal.is_person else session.get(ApiKey, principal.key_id)
     if found is None:
         raise _ended()
     return found

@@ -53,9 +53,9 @@ def share_of(session: Session, token: str) -> Share | None:
 
 def maker_of(session: Session, share: Share) -> ApiKey | Person | None:
     """Return the key or the person that made a share, which ends with it."""
-    table = Person if share.created_by.startswith("person_") else ApiKey
-    found: ApiKey | Person | None = session.get(table, share.created_by)
-    return found
+    if share.created_by.startswith("person_"):
+        return session.get(Person, share.created_by)
+    return session.get(ApiKey, share.created_by)
 
 
 def is_open(share: Share) -> bool:

@@ -29,9 +29,9 @@ FIRST_AGAIN_SECONDS = 3.0
 MOST_KEYS = 100
 WELL_KNOWN = "/.well-known/openid-configuration"
 NEEDED = ("authorization_endpoint", "token_endpoint", "jwks_uri")
-KIND_OF = {"RS": RSAKey, "PS": RSAKey, "ES": ECKey, "Ed": OKPKey}
-"""Kinds of keys by the first letters of the signatures that they check."""
 PublicKey = RSAKey | ECKey | OKPKey
+KIND_OF: dict[str, type[PublicKey]] = {"RS": RSAKey, "PS": RSAKey, "ES": ECKey, "Ed": OKPKey}
+"""Kinds of keys by the first letters of the signatures that they check."""
 
 
 @dataclass(frozen=True)
@@ -153,4 +153,4 @@ def _imported(given: object) -> PublicKey | None:
 
 
 def _fits(key: PublicKey, algorithm: str) -> bool:
-    return isinstance(key, KIND_OF[algorithm[:2]]) and key.get("alg", algorithm) == algorithm
+    return type(key) is KIND_OF[algorithm[:2]] and key.get("alg", algorithm) == algorithm

@@ -10,7 +10,7 @@ from typing import Any
 from authlib.oidc.core import CodeIDToken
 from joserfc import jws
 from joserfc.errors import ExpiredTokenError, InvalidClaimError, JoseError, MissingClaimError
-from joserfc.jwt import ClaimsOption, JWTClaimsRegistry
+from joserfc.jwt import JWTClaimsRegistry
 
 from specimap_service.auth.oidc.provider import Provider
 from specimap_service.errors import TokenExpiredError, TokenInvalidError
@@ -137,14 +137,15 @@ def _strictly(text: bytes) -> dict[str, Any]:
 
 
 def _check(claims: dict[str, Any], rules: Rules, issuer: str) -> None:
-    wanted: dict[str, ClaimsOption] = {
-        "iss": {"essential": True, "value": issuer},
-        "aud": {"essential": True, "value": rules.audience},
-        "sub": {"essential": True},
-        "exp": {"essential": True},
-    }
+    registry = JWTClaimsRegistry(
+        leeway=int(rules.skew_seconds),
+        iss={"essential": True, "value": issuer},
+        aud={"essential": True, "value": rules.audience},
+        sub={"essential": True},
+        exp={"essential": True},
+    )
     try:
-        JWTClaimsRegistry(leeway=int(rules.skew_seconds), **wanted).validate(claims)
+        registry.validate(claims)
     except ExpiredTokenError as error:
         raise TokenExpiredError("The access token has expired.", advice=_ADVICE, reason="expired") from error
     except (InvalidClaimError, MissingClaimError) as error:
