@@ -57,7 +57,7 @@ def get_sso(context: Context) -> SsoOptions:
     return SsoOptions(enabled=bool(settings.oidc_issuer), name=settings.oidc_name)
 
 
-@router.get("/login", status_code=303, response_class=Response, operation_id="sso.get_login")
+@router.get("/login", status_code=303, response_class=Response, operation_id="sso.get_start")
 def begin_sign_in(
     context: Context,
     request: Request,

@@ -84,7 +84,7 @@ OWN: dict[str, tuple[Refusal, ...]] = {
     "spectra.get_band": (*_ARRAYS, *_TURNS),
     "spectra.get_point": _CLOUD,
     "spectra.select": (*_ARRAYS, *_TURNS),
-    "sso.get_login": (service.SignInUnknownError, service.CrossSiteRequestError, service.RateLimitedError),
+    "sso.get_start": (service.SignInUnknownError, service.CrossSiteRequestError, service.RateLimitedError),
     "sso.get_callback": (service.SignInUnknownError, service.RateLimitedError),
     "uploads.create": (
         (412, service.RequestInvalidError),
