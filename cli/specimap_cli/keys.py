@@ -25,6 +25,7 @@ class Scope(StrEnum):
     read = "read"
     label = "label"
     intraoperative = "intraoperative"
+    audit = "audit"
     admin = "admin"
 
 

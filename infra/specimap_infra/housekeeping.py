@@ -42,6 +42,7 @@ from specimap_infra.tables import (
     Lease,
     RepeatableRequest,
     SignIn,
+    SignInAttempt,
     Upload,
 )
 
@@ -52,7 +53,9 @@ EVERY_SECONDS = 3600.0
 STOP_SECONDS = 3.0
 LEFTOVER_SECONDS = 24 * 3600.0
 """Age from which a file aside belongs to a process that was killed; none works on one for as long."""
-LEFTOVER = re.compile(r"^(?:(?:dicom-)?[0-9a-f]{32}|label-[0-9a-f]{32}(?:\.body)?|exp_[\w-]+|restore-[0-9a-f]{32})\.tmp$")
+LEFTOVER = re.compile(
+    r"^(?:(?:dicom-)?[0-9a-f]{32}|label-[0-9a-f]{32}(?:\.body)?|exp_[\w-]+|restore-[0-9a-f]{32})\.tmp$"
+)
 """Names that our programs give in the scratch folder, which may be shared with others."""
 AUDITED_AS = "service"
 REQUEST_DAYS = 7.0
@@ -106,6 +109,7 @@ class Housekeeping:
             "dicom": (s.keep_dicom_days, self._dicom),
             "requests": (REQUEST_DAYS, self._requests),
             "sessions": (SESSION_DAYS, self._sessions),
+            "attempts": (SESSION_DAYS, self._attempts),
         }
         removed = dict.fromkeys([*rules, "leftovers"], 0)
         for name, (days, batch) in rules.items():
@@ -192,6 +196,9 @@ class Housekeeping:
     def _sessions(self, before: datetime.datetime) -> int:
         return self._rows(SignIn.id, SignIn.expires_at < before)
 
+    def _attempts(self, before: datetime.datetime) -> int:
+        return self._rows(SignInAttempt.id, SignInAttempt.expires_at < before)
+
     def _rows(self, id: InstrumentedAttribute[str] | InstrumentedAttribute[int], rule: sa.ColumnElement[bool]) -> int:
         with self._database.session() as session:
             some = sa.select(id).where(rule).limit(BATCH)
@@ -267,6 +274,7 @@ def count_rows(session: Session) -> dict[str, int]:
     """Count the rows of what is kept by rule, and of leases."""
     tables: dict[str, sa.FromClause] = {
         "artefacts": Artefact.__table__,
+        "attempts": SignInAttempt.__table__,
         "audit": AuditEntry.__table__,
         "deliveries": Delivery.__table__,
         "dicom": DicomInstance.__table__,

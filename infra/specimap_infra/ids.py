@@ -7,8 +7,10 @@ from typing import Literal
 
 from ulid import ULID
 
-Kind = Literal["acq", "file", "up", "job", "cloud", "key", "exp", "evt", "att", "dlv", "prj", "shr", "dcs", "dci"]
-PATTERN = re.compile(r"^[a-z]{2,5}_[0-9a-hjkmnp-tv-z]{26}$")
+Kind = Literal[
+    "acq", "file", "up", "job", "cloud", "key", "exp", "evt", "att", "dlv", "prj", "shr", "dcs", "dci", "person"
+]
+PATTERN = re.compile(r"^[a-z]{2,6}_[0-9a-hjkmnp-tv-z]{26}$")
 
 
 def new_id(kind: Kind) -> str:

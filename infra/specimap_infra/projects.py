@@ -7,6 +7,7 @@ so that an acquisition and its results are never divided; jobs and clouds hold a
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import sqlalchemy as sa
@@ -25,6 +26,7 @@ from specimap_infra.tables import (
     CloudRow,
     Export,
     Job,
+    Person,
     Project,
     Share,
     StoredFile,
@@ -38,6 +40,8 @@ PROJECT_NAME = r"^(?!prj_)[A-Za-z0-9._-]{1,64}$"
 
 _OWNERS: dict[str, sa.Select[str]] = {
     "prj": sa.select(Project.id),
+    # A person is of no project.
+    "person": sa.select(sa.literal("")).select_from(Person),
     "key": sa.select(ApiKey.project_id),
     "acq": sa.select(Acquisition.project_id),
     **{
@@ -56,6 +60,7 @@ _OWNERS: dict[str, sa.Select[str]] = {
 }
 _IDS = {
     "prj": Project.id,
+    "person": Person.id,
     "key": ApiKey.id,
     "acq": Acquisition.id,
     "file": StoredFile.id,
@@ -73,13 +78,16 @@ def project_of(session: Session, object_id: str) -> str | None:
     return session.scalar(_OWNERS[kind].where(_IDS[kind] == object_id))
 
 
-def within(table: type[Base], projects: sa.Select[str] | str) -> sa.ColumnElement[bool]:
-    """Make the condition that rows of a table belong to a project, given by its id or a query for one id."""
-    # Not `in`, with which SQLite would sort all that a large project has for each page.
-    wanted = projects if isinstance(projects, str) else projects.scalar_subquery()
+def within(table: type[Base], projects: sa.Select[str] | Sequence[str]) -> sa.ColumnElement[bool]:
+    """Make the condition that rows of a table belong to one of some projects, given by ids, or a query for one id."""
+    if isinstance(projects, Sequence) and not projects:
+        return sa.false()
+    several = isinstance(projects, Sequence) and len(projects) > 1
+    one = projects[0] if isinstance(projects, Sequence) else projects.scalar_subquery()
 
     def is_one(column: Any) -> sa.ColumnElement[bool]:
-        found: sa.ColumnElement[bool] = column == wanted
+        # Not always `in`, with which SQLite would sort all that a large project has for each page.
+        found: sa.ColumnElement[bool] = column.in_(projects) if several else column == one
         return found
 
     if table is Project:

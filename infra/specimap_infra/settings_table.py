@@ -50,11 +50,19 @@ def _default(name: str, field: FieldInfo) -> str:
         raise TypeError(f"{name} has no default")
     if value in ("", None) or (isinstance(value, SecretStr) and not value.get_secret_value()):
         return ""
+    if isinstance(value, bool):
+        return str(value).lower()
     if name.endswith("_bytes"):
         for unit, size in (("GiB", GIB), ("MiB", MIB)):
             if value and value % size == 0:
                 return f"{value} ({value // size} {unit})"
-    return f"`{value}`" if isinstance(value, str | list) else f"{value:g}" if isinstance(value, float) else str(value)
+    return (
+        f"`{value}`"
+        if isinstance(value, str | list | dict)
+        else f"{value:g}"
+        if isinstance(value, float)
+        else str(value)
+    )
 
 
 def _takes(name: str, field: FieldInfo) -> str:
@@ -62,9 +70,13 @@ def _takes(name: str, field: FieldInfo) -> str:
     if get_origin(kind) is Literal:
         return ", ".join(f"`{choice}`" for choice in get_args(kind))
     if kind in (Path, Path | None):
-        return "a folder"
+        return "a file" if name.endswith("_file") else "a folder"
     if kind == list[str]:
         return "a JSON list of text"
+    if kind is bool:
+        return "`true` or `false`"
+    if kind == dict[str, str]:
+        return "a JSON object of text"
     if kind in (str, SecretStr):
         return "text" if kind is str else "text, a secret"
     noun = {int: "whole number", float: "number"}[kind]

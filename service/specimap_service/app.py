@@ -17,7 +17,7 @@ from specimap_service.acquisitions import dependencies as acquisitions
 from specimap_service.acquisitions import file_routes, viewpoint_routes
 from specimap_service.acquisitions import routes as acquisition_routes
 from specimap_service.auth import dependencies as auth
-from specimap_service.auth import project_routes, session_routes
+from specimap_service.auth import project_routes, session_routes, sso_routes
 from specimap_service.auth import routes as key_routes
 from specimap_service.body_limits import BodyLimits
 from specimap_service.clouds import dependencies as clouds
@@ -63,6 +63,7 @@ ROUTES = (
     project_routes,
     key_routes,
     session_routes,
+    sso_routes,
     acquisition_routes,
     form_routes,
     file_routes,

@@ -11,8 +11,39 @@ class UnauthorizedError(SpecimapError, PermissionError):
     code = "unauthorized"
 
 
+class TokenInvalidError(UnauthorizedError):
+    """The access token is not one that counts here; ``details['reason']`` says what is wrong with it."""
+
+    code = "token_invalid"
+
+
+class TokenExpiredError(UnauthorizedError):
+    """The access token has expired; the identity provider gives a new one."""
+
+    code = "token_expired"
+
+
+class IdentityUnavailableError(SpecimapError, ConnectionError):
+    """The identity provider does not answer, or not as it should: nobody signs in with it, and keys go on working."""
+
+    code = "identity_unavailable"
+
+
+class SignInRefusedError(SpecimapError, PermissionError):
+    """A sign-in with the identity provider did not succeed; ``details['reason']`` says why."""
+
+    code = "sign_in_refused"
+
+
+class SignInUnknownError(SpecimapError, LookupError):
+    """The service has no identity provider."""
+
+    code = "sign_in_not_configured"
+
+
 class ForbiddenError(SpecimapError, PermissionError):
-    """The key is valid but lacks the scope, which ``details['scope']`` names; or a share shows another result."""
+    """The key is valid but lacks the scope, which ``details['scope']`` names; a person's roles lack the permission in
+    ``details['permission']``; or a share shows another result."""
 
     code = "forbidden"
 

@@ -17,10 +17,10 @@ from specimap_infra.database import database_errors
 from specimap_infra.errors import DatabaseUnavailableError, StorageUnavailableError
 from specimap_infra.logs import logger
 from specimap_service.context import correlation_id
-from specimap_service.errors import RateLimitedError, RequestInvalidError, UnauthorizedError
+from specimap_service.errors import IdentityUnavailableError, RateLimitedError, RequestInvalidError, UnauthorizedError
 from specimap_service.http_status import error_class, status_of
 
-AWAY = (DatabaseUnavailableError, StorageUnavailableError)
+AWAY = (DatabaseUnavailableError, IdentityUnavailableError, StorageUnavailableError)
 RETRY_AFTER_SECONDS = "5"
 MEDIA_TYPE = "application/problem+json"
 CLIENT_CLOSED = 499

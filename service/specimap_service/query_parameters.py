@@ -13,6 +13,9 @@ from fastapi.routing import APIRoute
 from specimap_service.errors import RequestInvalidError
 from specimap_service.uploads.tus_routes import NOT_SERVED
 
+OPEN = ("sso.get_callback",)
+"""Operations to which another program sends a browser, with parameters of its own."""
+
 
 async def check_query(request: Request) -> None:
     """Check the names in the query: a dependency of all operations, ``async`` so that it takes no thread.
@@ -23,11 +26,15 @@ async def check_query(request: Request) -> None:
     route = request.scope.get("route")
     if not request.query_params or not isinstance(route, APIRoute):
         return
-    known = known_parameters(route)
+    known, open = known_parameters(route), route.operation_id in OPEN
     given = [name for name, _ in request.query_params.multi_items()]
     unreadable = {name for name, value in request.query_params.multi_items() if "\0" in value}
     fields = [
-        *({"where": f"query.{name[:100]}", "what": "not known here"} for name in given if name not in known),
+        *(
+            {"where": f"query.{name[:100]}", "what": "not known here"}
+            for name in given
+            if name not in known and not open
+        ),
         *(
             {"where": f"query.{name}", "what": "given more than once"}
             for name, several in known.items()

@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 
 from specimap_core.atomic import disk_errors
 from specimap_core.errors import StorageFullError
-from specimap_infra.tables import ApiKey, LabelVersion, StoredFile, Upload
+from specimap_infra.tables import ApiKey, LabelVersion, Person, StoredFile, Upload
 from specimap_service.auth.keys import Principal
 from specimap_service.context import AppContext
 from specimap_service.errors import QuotaExceededError
@@ -19,11 +19,13 @@ DISK_EVERY = 64 * 1024 * 1024
 
 
 def check_quota(session: Session, principal: Principal, new: int) -> None:
-    """Raise QuotaExceededError where ``new`` more bytes are over the key's quota. Locks the key's row."""
-    session.execute(
-        sa.update(ApiKey).where(ApiKey.id == principal.key_id).values(name=ApiKey.name),
-        execution_options={"synchronize_session": False},
+    """Raise QuotaExceededError where ``new`` more bytes are over the quota. Locks the row of the key or person."""
+    lock = (
+        sa.update(Person).where(Person.id == principal.key_id).values(issuer=Person.issuer)
+        if principal.is_person
+        else sa.update(ApiKey).where(ApiKey.id == principal.key_id).values(name=ApiKey.name)
     )
+    session.execute(lock, execution_options={"synchronize_session": False})
     if new > quota_left(session, principal):
         raise over_quota(principal, new)
 

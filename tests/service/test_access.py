@@ -15,18 +15,29 @@ from fastapi.dependencies.models import Dependant
 from fastapi.routing import iter_route_contexts
 
 from specimap_infra.database import Database
+from specimap_infra.settings.identity import PERSON_ROLES
 from specimap_infra.study_keys import new_key
-from specimap_infra.tables import Base
+from specimap_infra.tables import SCOPES, Base
 from specimap_service.auth.dependencies import known_principal
 from specimap_service.auth.object_ids import GUARDS
+from specimap_service.auth.permissions import (
+    AUDIT_ALL,
+    EQUIVALENT,
+    EVERYTHING,
+    OPERATIONS,
+    ROLES,
+    SCOPE_PERMISSIONS,
+    SHARE,
+    of_scopes,
+    roles_for,
+    scope_for,
+)
+from specimap_service.contract.description import operations
 from specimap_service.uploads.tus_routes import _check_request
-from tests.support.access_scene import CASES, LESSER_SCOPES, OTHERS, make_world
+from tests.support.access_scene import CASES, LESSER_SCOPES, NO_KEY, OTHERS, make_world
 from tests.support.documented import contract
 from tests.support.service_scene import Running, serving
 from tests.support.upload_scene import new_acquisition, sent
-
-NO_KEY = {("GET", "/healthz"), ("GET", "/readyz"), ("POST", "/v1/session")}
-"""What needs no key; the last one takes it in its body."""
 
 
 @pytest.fixture
@@ -93,6 +104,76 @@ def test_key_does_what_its_scope_says_in_its_project(any_service: Running, tmp_p
             holder = any_service.client([case.scope or "read", *case.also], project=project)
         answer = case.send(holder, method, path, world)
         assert answer.status_code == case.status, f"{method} {path}: {answer.status_code} {answer.text[:300]}"
+
+
+def test_the_table_of_permissions_has_every_operation_and_nothing_else() -> None:
+    asked = {
+        operation["operationId"]
+        for method, path, operation in operations(contract())
+        if (method.upper(), path) not in NO_KEY
+    }
+    assert asked <= set(OPERATIONS), "say who may do it in service/specimap_service/auth/permissions.py"
+    assert set(OPERATIONS) <= asked, "these operations are gone: take them out of the table"
+    assert {held for held in OPERATIONS.values() if held is not None} <= EVERYTHING
+    assert set(ROLES) == set(PERSON_ROLES)
+    assert set(SCOPE_PERMISSIONS) == set(SCOPES)
+    for permission in EVERYTHING:
+        assert roles_for(permission), permission
+        assert permission in SCOPE_PERMISSIONS[scope_for(permission)]
+    # Only those that see all projects anyway see their trails; every other key sees its own project's.
+    assert [scope for scope in SCOPES if AUDIT_ALL in SCOPE_PERMISSIONS[scope]] == ["admin"]
+    for role, scopes in EQUIVALENT.items():
+        assert of_scopes(scopes) ^ ROLES[role] <= {SHARE, AUDIT_ALL}, role
+
+
+def test_person_does_what_the_role_says_in_its_projects(any_service: Running, tmp_path: Path) -> None:
+    project = any_service.project("theirs")
+    other = any_service.project("also-theirs")
+    holders = {role: any_service.person_client([role], [project, other]) for role in ROLES}
+    nobody = any_service.person_client([], [project])
+    world = make_world(any_service, tmp_path / "result", project, holders["technician"])
+    for (method, path), case in CASES.items():
+        permission = OPERATIONS[operation_at(method, path)]
+        allowed = [role for role in ROLES if permission in ROLES[role]]
+        for role, holder in {**holders, "none": nobody}.items():
+            if permission is None or role in allowed:
+                continue
+            answer = case.send(holder, method, path, world)
+            assert answer.status_code == 403, f"{method} {path} as {role}: {answer.text[:300]}"
+            if method != "HEAD":
+                assert (answer.json()["code"], answer.json()["details"]) == ("forbidden", {"permission": permission})
+        # The least of those that may; the last one signs out, which ends a session of its own.
+        holder = any_service.person_client(["auditor"], []) if permission is None else holders[least(allowed)]
+        answer = case.send(holder, method, path, world)
+        needs_project = (method, path) in {("POST", "/v1/acquisitions"), ("POST", "/v1/keys")}
+        if needs_project:
+            assert (answer.status_code, answer.json()["details"]["projects"]) == (422, sorted([project, other]))
+            body = {**case.given(world)["json"], "project": project}
+            answer = holder.request(method, path, json=body)
+        assert answer.status_code == case.status, f"{method} {path}: {answer.status_code} {answer.text[:300]}"
+
+
+def operation_at(method: str, path: str) -> str:
+    found: str = contract()["paths"][path][method.lower()]["operationId"]
+    return found
+
+
+def least(roles: list[str]) -> str:
+    return min(roles, key=lambda role: (role != "technician", len(ROLES[role])))
+
+
+def test_auditor_reads_the_trail_and_nothing_clinical(any_service: Running, tmp_path: Path) -> None:
+    project = any_service.project("theirs")
+    world = make_world(any_service, tmp_path / "result", project, any_service.client(project=project))
+    auditor = any_service.person_client(["auditor"], [])
+    read = [path for (method, path), case in CASES.items() if auditor_may(method, path)]
+    assert read == ["/v1/audit"]
+    entries = auditor.get("/v1/audit", params={"project": "theirs"}).json()["items"]
+    assert world.ids["upload_id"] in {entry["target"] for entry in entries}
+
+
+def auditor_may(method: str, path: str) -> bool:
+    return OPERATIONS[operation_at(method, path)] in ROLES["auditor"]
 
 
 def test_administrator_does_everything_in_every_project(any_service: Running, tmp_path: Path) -> None:
@@ -196,7 +277,7 @@ def seen(answer: httpx.Response) -> tuple[int, dict[str, str], str]:
     """Everything that an answer tells, but for its moment, its turn, and the ids that the request named."""
     # Each request of a key leaves it one less, whatever it asks for.
     headers = {k: v for k, v in answer.headers.items() if k not in ("date", "x-correlation-id", "ratelimit")}
-    text = re.sub(r"\b([a-z]{2,5})_[0-9a-z]{26}\b", r"\1", answer.text)
+    text = re.sub(r"\b([a-z]{2,6})_[0-9a-z]{26}\b", r"\1", answer.text)
     return answer.status_code, headers, re.sub(r'"correlation_id":"\w+"', "", text)
 
 

@@ -18,13 +18,14 @@ from jsonschema import Draft202012Validator
 from specimap_core.errors import BackendUnavailableError
 from specimap_infra import jobs
 from specimap_service.auth import dependencies
+from specimap_service.auth.permissions import OPERATIONS
 from specimap_service.contract.description import operations
 from specimap_service.contract.refusals import OWN
 from specimap_service.errors import OverloadedError, RateLimitedError
 from specimap_service.http_status import HTTP_STATUS
 from specimap_service.problems import Problem
 from tests.support import documented
-from tests.support.access_scene import CASES
+from tests.support.access_scene import CASES, NO_KEY
 from tests.support.job_scene import acquisition, queued_job
 from tests.support.places import ROOT, SUPPORT
 from tests.support.plain_http import NO_TLS
@@ -73,7 +74,7 @@ def test_every_operation_says_what_it_is_and_how_it_refuses(contract: dict[str, 
 def test_every_operation_but_health_wants_a_key(contract: dict[str, Any], service: Running) -> None:
     with httpx.Client(base_url=service.url, trust_env=False, verify=NO_TLS) as stranger:
         for method, path, operation in operations(contract):
-            if path in ("/healthz", "/readyz") or operation["operationId"] == "sessions.create":
+            if (method.upper(), path) in NO_KEY:
                 continue
             assert operation["security"], f"{method} {path}"
             for name in ("key", "acquisition", "file", "job", "cloud", "project", "share"):
@@ -125,7 +126,21 @@ def test_cameras_are_served_as_they_lie_and_missed_in_older_results(service: Run
 
 
 VERBS = {
-    *("append", "cancel", "create", "delete", "follow", "get", "head", "list", "put", "rerun", "revoke", "select"),
+    *(
+        "append",
+        "cancel",
+        "create",
+        "delete",
+        "end",
+        "follow",
+        "get",
+        "head",
+        "list",
+        "put",
+        "rerun",
+        "revoke",
+        "select",
+    ),
     "update",
 }
 
@@ -145,7 +160,7 @@ def test_operations_are_named_by_resource_and_verb(contract: dict[str, Any]) -> 
             "put": {"put"},
             "patch": {"update", "append"},
             "delete": {"delete", "revoke"},
-            "post": {"create", "cancel", "rerun", "select"},
+            "post": {"create", "cancel", "end", "rerun", "select"},
         }
         assert verb in allowed[method], f"{method} {path}: {name}"
     for name in contract["components"]["schemas"]:
@@ -155,13 +170,14 @@ def test_operations_are_named_by_resource_and_verb(contract: dict[str, Any]) -> 
 
 def test_scope_of_each_operation_is_the_one_that_is_checked(contract: dict[str, Any]) -> None:
     for method, path, operation in operations(contract):
-        if path in ("/healthz", "/readyz") or operation["operationId"] == "sessions.create":
+        if (method.upper(), path) in NO_KEY:
             assert "security" not in operation
         else:
             case = CASES[method.upper(), path]
             scopes = [] if case.scope is None else [case.scope]
             assert operation["security"] == [{"key": scopes}, {"session": scopes}], f"{method} {path}"
-            assert all(f"Scope: `{scope}`." in operation["description"] for scope in scopes)
+            assert all(f"of keys with the scope `{scope}`" in operation["description"] for scope in scopes)
+            assert operation.get("x-permission") == OPERATIONS[operation["operationId"]], f"{method} {path}"
 
 
 def test_refusals_are_those_of_the_table_of_statuses(contract: dict[str, Any]) -> None:

@@ -99,7 +99,10 @@ def test_a_person_signs_in_looks_and_signs_out(any_service: Running) -> None:
         "name": "test",
         "project_id": DEFAULT_PROJECT,
         "project": "default",
+        "projects": [{"id": DEFAULT_PROJECT, "name": "default"}],
         "scopes": ["upload", "read"],
+        "roles": [],
+        "permissions": ["capture.write", "job.run", "result.read", "share.manage"],
         "cloud_id": None,
     }
     cookie = cookie_of(answer)

@@ -17,6 +17,7 @@ from specimap_infra.database import utc_now
 from specimap_infra.tables import ApiKey, AuditEntry, Share, SignIn
 from specimap_service.auth.dependencies import check_shared
 from specimap_service.auth.keys import Principal
+from specimap_service.auth.permissions import of_scopes
 from specimap_service.clouds import share_routes
 from specimap_service.contract.description import operations
 from tests.support.access_scene import CASES, World, make_world
@@ -177,7 +178,7 @@ CLOUD = f"cloud_{'0' * 26}"
     ],
 )
 def test_the_one_check_compares_whole_names(method: str, path: str, open: bool) -> None:
-    guest = Principal("shr_1", "prj_1", frozenset({"read"}), 1, 1, "s", CLOUD)
+    guest = Principal("shr_1", ("prj_1",), of_scopes(["read"]), ("read",), 1, 1, "s", CLOUD)
     if open:
         check_shared(guest, method, path)
     else:
@@ -192,7 +193,7 @@ def test_lists_show_a_share_nothing_even_past_the_check(service: Running, tmp_pa
 
     result, other = put_result(service, tmp_path / "result"), put_result(service, tmp_path / "other")
     project = service.client().get("/v1/session").json()["project_id"]
-    guest = Principal("shr_1", project, frozenset({"read"}), 1, 1, "s", result.cloud_id)
+    guest = Principal("shr_1", (project,), of_scopes(["read"]), ("read",), 1, 1, "s", result.cloud_id)
     with service.database.session() as session:
         seen = {
             table: session.scalars(sa.select(table.id).where(in_sight(guest, table))).all()

@@ -21,6 +21,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from specimap_infra.database import Database
+from specimap_infra.ids import new_id
 from specimap_infra.logs import SHARED
 from specimap_infra.projects import DEFAULT_PROJECT, new_project
 from specimap_infra.settings import ServiceSettings, load_settings
@@ -29,13 +30,15 @@ from specimap_service.acquisitions import dependencies
 from specimap_service.acquisitions.judge import Judge
 from specimap_service.app import create_app
 from specimap_service.auth.keys import new_key
+from specimap_service.auth.people import Granted, known_person
+from specimap_service.auth.sessions import new_session
 from specimap_service.page_files import FOLDER
 from specimap_service.server import server_config
 from tests.support.databases import create_tables
 from tests.support.documented import check_refusal
 from tests.support.plain_http import NO_TLS
 
-ALL_SCOPES = ("upload", "read", "label", "intraoperative", "admin")
+ALL_SCOPES = ("upload", "read", "label", "intraoperative", "audit", "admin")
 
 
 @dataclass
@@ -72,6 +75,15 @@ class Running:
             session.add(row)
         return key
 
+    def person_client(self, roles: Sequence[str], projects: Sequence[str] = (DEFAULT_PROJECT,)) -> httpx.Client:
+        """A client with the session of a new person who has these roles in these projects; closed with the service."""
+        with self.database.session() as session:
+            person = known_person(session, "https://idp.test", new_id("person"))
+            granted = Granted(person.id, tuple(roles), tuple(projects))
+            _, token = new_session(session, person, 1.0, granted=granted.stored())
+        headers = {"Cookie": f"specimap_session={token}", "Specimap-Page": "1"}
+        return self._client(headers)
+
     def project(self, name: str) -> str:
         """A new project's id."""
         with self.database.session() as session:
@@ -81,7 +93,9 @@ class Running:
         self, scopes: Sequence[str] = ALL_SCOPES, *, project: str = DEFAULT_PROJECT, **options: int
     ) -> httpx.Client:
         """A client with a new key of these scopes; closed with the service."""
-        headers = {"Authorization": f"Bearer {self.key(scopes, project=project, **options)}"}
+        return self._client({"Authorization": f"Bearer {self.key(scopes, project=project, **options)}"})
+
+    def _client(self, headers: dict[str, str]) -> httpx.Client:
         hooks = {"response": [check_refusal]}
         client = httpx.Client(
             base_url=self.url, headers=headers, timeout=60, trust_env=False, verify=NO_TLS, event_hooks=hooks
@@ -119,8 +133,11 @@ def pytest_sessionfinish() -> None:
 
 
 @contextmanager
-def serving(folder: Path, *, own_judge: bool = False, pages: Path = FOLDER, **given: object) -> Iterator[Running]:
-    """Serve from a folder until the block ends; ``given`` are settings, ``pages`` the folder of the web pages.
+def serving(
+    folder: Path, *, own_judge: bool = False, pages: Path = FOLDER, bound: int = 0, **given: object
+) -> Iterator[Running]:
+    """Serve from a folder until the block ends; ``given`` are settings, ``pages`` the folder of the web pages,
+    ``bound`` the port, where it must be known before.
 
     ``own_judge``: with judging processes of its own, for tests of these and of settings that concern them.
     """
@@ -136,7 +153,7 @@ def serving(folder: Path, *, own_judge: bool = False, pages: Path = FOLDER, **gi
     database.close()
     with mock.patch.object(dependencies, "Judge", Judge if own_judge else lambda *_: shared_judge()):
         app = create_app(settings, pages)
-    server = uvicorn.Server(server_config(app, settings, host="127.0.0.1", port=0))
+    server = uvicorn.Server(server_config(app, settings, host="127.0.0.1", port=bound))
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
     deadline = time.monotonic() + 20

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from specimap_client._http import Session, path
 from specimap_client._models import Key, NewKey, Project, id_of
 
-Scope = Literal["upload", "read", "label", "intraoperative", "admin"]
+Scope = Literal["upload", "read", "label", "intraoperative", "audit", "admin"]
 
 
 class Keys:

@@ -21,12 +21,12 @@ from specimap_infra.database import Database, database_errors
 from specimap_infra.postgres import unhurried
 from specimap_infra.references import REMAKEABLE, Reference, reference_of
 from specimap_infra.schema_version import refuse_newer, revision_of
-from specimap_infra.tables import Base, Lease, SignIn, UploadPart
+from specimap_infra.tables import Base, Lease, SignIn, SignInAttempt, UploadPart
 
 BATCH = 500
-LEFT_OUT = frozenset({Lease.__tablename__, SignIn.__tablename__, UploadPart.__tablename__})
+LEFT_OUT = frozenset({Lease.__tablename__, SignIn.__tablename__, SignInAttempt.__tablename__, UploadPart.__tablename__})
 """Leases belong to workers of the machine that was saved; unfinished uploads are not saved; and a session that somebody
-has ended since must not come back."""
+has ended since must not come back, nor a sign-in under way."""
 
 
 @dataclass

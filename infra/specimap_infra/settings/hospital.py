@@ -89,7 +89,8 @@ class HospitalSettings(StudySettings):
         default=0, ge=0, le=65535, description="Port for C-ECHO, C-STORE and the archive's commitment; 0: none."
     )
     dicom_tls: Literal["off", "on"] = Field(
-        default="off", description="Whether the DICOM port is encrypted; peers then show a certificate of the authority."
+        default="off",
+        description="Whether the DICOM port is encrypted; peers then show a certificate of the authority.",
     )
     dicom_peers: list[str] = Field(
         default_factory=list,

@@ -12,6 +12,7 @@ from specimap_core.errors import SettingsError
 from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES, backends_from
 from specimap_infra.settings.fhir import FhirSettings
 from specimap_infra.settings.hospital import HospitalSettings
+from specimap_infra.settings.identity import IdentitySettings
 from specimap_infra.settings.logging import LogSettings
 from specimap_infra.settings.places import PlaceSettings
 from specimap_infra.settings.retention import RetentionSettings
@@ -38,6 +39,7 @@ class ServiceSettings(
     WebhookSettings,
     WorkerSettings,
     UploadSettings,
+    IdentitySettings,
     ServerSettings,
     PlaceSettings,
     BaseSettings,

@@ -10,6 +10,7 @@ from specimap_infra.tables.fhir import FhirNotice
 from specimap_infra.tables.hospital import DicomInstance, DicomSet, SealedStudy
 from specimap_infra.tables.jobs import Artefact, Delivery, Job, JobEvent, Lease, RepeatableRequest
 from specimap_infra.tables.names import DICOM_STATES, FINAL_STATES, JOB_STATES, PRIORITIES, QUEUED, ROLES, SCOPES
+from specimap_infra.tables.people import Person, SignInAttempt
 
 __all__ = [
     "DICOM_STATES",
@@ -34,11 +35,13 @@ __all__ = [
     "JobEvent",
     "LabelVersion",
     "Lease",
+    "Person",
     "Project",
     "RepeatableRequest",
     "SealedStudy",
     "Share",
     "SignIn",
+    "SignInAttempt",
     "StoredFile",
     "Upload",
     "UploadPart",

@@ -43,13 +43,19 @@ class ApiKey(Base):
 
 
 class SignIn(Base):
-    """A session of a person who signed in with a key on a page; only the hash of its token is kept."""
+    """A session of a person who signed in on a page, with a key or with an identity provider; only the hash of its
+    token is kept."""
 
     __tablename__ = "sessions"
 
     id: Mapped[str] = mapped_column(primary_key=True)
     """SHA-256 of the token that the browser holds as a cookie."""
-    key_id: Mapped[str] = owned_by("api_keys")
+    key_id: Mapped[str | None] = owned_by("api_keys")
+    """The key that it stands for, or by which the share was made."""
+    person_id: Mapped[str | None] = owned_by("people")
+    """The person that it is of, or who made the share, where no key stands behind it."""
+    granted: Mapped[dict[str, Any] | None]
+    """Of a person who signed in: names of roles, ids of projects, as the identity provider said then."""
     share_id: Mapped[str | None] = mapped_column(index=True)
     """The share whose link made it: it sees that share's cloud alone."""
     created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now)
@@ -67,14 +73,14 @@ class Share(Base):
     secret_hash: Mapped[str]
     created_at: Mapped[datetime.datetime] = mapped_column(default=utc_now)
     created_by: Mapped[str]
-    """The key that made it, with which it ends."""
+    """The key or the person that made it, with which it ends."""
     expires_at: Mapped[datetime.datetime]
     revoked_at: Mapped[datetime.datetime | None]
     last_used_at: Mapped[datetime.datetime | None]
 
 
 class AuditEntry(Base):
-    """An entry of the audit trail: which key did what to which object. It outlives the object."""
+    """An entry of the audit trail: which key or person did what to which object. It outlives the object."""
 
     __tablename__ = "audit"
     __table_args__ = (sa.Index("ix_audit_project_id", "project_id", "id"),)
@@ -82,8 +88,9 @@ class AuditEntry(Base):
     id: Mapped[int] = mapped_column(sa.BigInteger().with_variant(sa.Integer, "sqlite"), primary_key=True)
     at: Mapped[datetime.datetime] = mapped_column(default=utc_now, index=True)
     key_id: Mapped[str]
+    """Of a key, a person or a share."""
     project_id: Mapped[str]
-    """The project of the target."""
+    """The project of the target; empty where that is of no project."""
     action: Mapped[str]
     target: Mapped[str] = mapped_column(index=True)
     details: Mapped[dict[str, Any]]

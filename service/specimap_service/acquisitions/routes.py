@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import datetime
-from typing import Annotated, cast, get_args
+from typing import Annotated, Any, cast, get_args
 
 import sqlalchemy as sa
 from fastapi import APIRouter, Query, Response
@@ -20,7 +20,7 @@ from specimap_infra.tables import FINAL_STATES, Acquisition, Job, Upload
 from specimap_service.acquisitions.capacity import locked_acquisition
 from specimap_service.acquisitions.dependencies import JudgeDep, UnfinishedUploadsDep
 from specimap_service.acquisitions.schemas import FileCounts, counts
-from specimap_service.auth.access import in_sight, load, not_found
+from specimap_service.auth.access import in_sight, load, not_found, project_for_new
 from specimap_service.auth.dependencies import Admin, Reader, Uploader
 from specimap_service.auth.object_ids import AcquisitionId
 from specimap_service.clouds.dependencies import CloudsDep
@@ -55,6 +55,13 @@ class AcquisitionRequest(BaseModel):
     notes: Annotated[str, StringConstraints(max_length=2000, pattern=r"^[^\x00]*$")] = Field(
         "", description="About the capture; no patient's data."
     )
+    project: Pseudonym | None = Field(
+        None, description="Id or name of its project, for good; needed by a person who has several."
+    )
+
+    def asked(self) -> dict[str, Any]:
+        """Return what is compared when the request is sent again, as it was before there was a project in it."""
+        return self.model_dump(mode="json", exclude={"project"} if self.project is None else None)
 
 
 class AcquisitionView(BaseModel):
@@ -90,10 +97,10 @@ def create_acquisition(
     def make(session: Session, _: str) -> tuple[str, AcquisitionView]:
         row = Acquisition(
             id=new_id("acq"),
-            project_id=principal.project_id,
+            project_id=project_for_new(session, principal, wanted.project),
             created_by=principal.key_id,
             created_at=utc_now(),
-            **wanted.model_dump(),
+            **wanted.model_dump(exclude={"project"}),
         )
         session.add(row)
         audit(session, principal.key_id, "acquisition.create", row.id)
@@ -103,7 +110,7 @@ def create_acquisition(
     def again(session: Session, acquisition_id: str, _: str) -> AcquisitionView:
         return _view(session, load(session, principal, Acquisition, acquisition_id))
 
-    request = Repeatable.of(principal, idempotency_key, "acquisitions.create", wanted.model_dump(mode="json"))
+    request = Repeatable.of(principal, idempotency_key, "acquisitions.create", wanted.asked())
     view, new = request.once(context.database, make, again)
     judge.warm()
     response.status_code = 201 if new else 200

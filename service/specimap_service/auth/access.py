@@ -1,4 +1,5 @@
-"""Which objects a key may touch: those of its project; an administrator's key all; a share its cloud.
+"""Which objects a key may touch: those of its project; a person those of all its projects; an administrator all; a
+share its cloud.
 
 An object of another project is answered exactly like one that does not exist: both are looked for by the same query,
 and refused by the same error.
@@ -16,8 +17,10 @@ from sqlalchemy.orm import Session
 from specimap_core.errors import NotFoundError
 from specimap_infra.database import Database
 from specimap_infra.projects import named, no_project, project_of, within
-from specimap_infra.tables import Base, CloudRow, Project
+from specimap_infra.tables import AuditEntry, Base, CloudRow, Project
 from specimap_service.auth.keys import Principal
+from specimap_service.auth.permissions import AUDIT_ALL
+from specimap_service.errors import ForbiddenError, RequestInvalidError
 
 _MOST_KNOWN = 20_000
 _ADVICE = {
@@ -62,10 +65,38 @@ def in_sight(principal: Principal, table: type[Base], project: str | None = None
     """
     if principal.cloud_id is not None:
         return table.__table__.c.id == principal.cloud_id if table is CloudRow else sa.false()
+    sees_all = principal.is_admin or (table is AuditEntry and principal.may(AUDIT_ALL))
     if project is None:
-        return sa.true() if principal.is_admin else within(table, principal.project_id)
+        return sa.true() if sees_all else within(table, principal.project_ids)
     wanted = sa.select(Project.id).where(named(project))
-    return within(table, wanted if principal.is_admin else wanted.where(Project.id == principal.project_id))
+    return within(table, wanted if sees_all else wanted.where(Project.id.in_(principal.project_ids)))
+
+
+def project_for_new(session: Session, principal: Principal, wanted: str | None) -> str:
+    """Return the id of the project that a new object will have. ``wanted``: its id or name, if the request says one.
+
+    Raises:
+        NotFoundError: there is no such project, or it is not among the principal's.
+        RequestInvalidError: the request must say one, since the principal has several.
+        ForbiddenError: it has none.
+    """
+    if wanted is not None:
+        found = session.scalar(sa.select(Project.id).where(named(wanted), in_sight(principal, Project)))
+        if found is None:
+            raise no_project(wanted)
+        return found
+    if not principal.project_ids:
+        raise ForbiddenError(
+            "Your account belongs to no project.", advice="Ask whoever manages the accounts for the group of one."
+        )
+    if len(principal.project_ids) > 1:
+        raise RequestInvalidError(
+            "body.project: needed, since you have several projects.",
+            advice="Name one of them; GET /v1/session lists them.",
+            fields=[{"where": "body.project", "what": "needed"}],
+            projects=list(principal.project_ids),
+        )
+    return principal.project_ids[0]
 
 
 class Access:
@@ -84,13 +115,13 @@ class Access:
         if principal.cloud_id is not None:
             return object_id == principal.cloud_id
         # Its project never changes. Whatever another project has is unknown: it takes a query as if it did not exist.
-        return principal.is_admin or self._known.get(object_id) == principal.project_id
+        return principal.is_admin or self._known.get(object_id) in principal.project_ids
 
     def check(self, principal: Principal, object_id: str) -> None:
         """Raise NotFoundError unless the key may touch the object."""
         with self._database.session() as session:
             project = project_of(session, object_id)
-        if project is None or project != principal.project_id or principal.cloud_id is not None:
+        if project is None or project not in principal.project_ids or principal.cloud_id is not None:
             raise not_found(object_id)
         with self._lock:
             self._known[object_id] = project

@@ -1,4 +1,4 @@
-"""What a request presents to be known: a key in a header, or the cookie of a session."""
+"""What a request presents to be known: a key or an access token in a header, or the cookie of a session."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ SAFE = ("GET", "HEAD", "OPTIONS")
 
 @dataclass(frozen=True)
 class Credential:
-    """A key, or the token of a session or of a share."""
+    """A key, the token of a session or of a share, or an access token of the identity provider."""
 
-    kind: Literal["key", "session", "share"]
+    kind: Literal["key", "session", "share", "token"]
     secret: str = field(repr=False)
 
     @property
@@ -64,7 +64,9 @@ def credential_of(request: Request) -> Credential:
     kind, _, key = (header or "").partition(" ")
     if kind.lower() != "bearer" or not key.strip():
         raise UnauthorizedError("There is no key.", advice="Send it as `Authorization: Bearer <key>`, or sign in.")
-    return Credential("key", key.strip())
+    secret = key.strip()
+    # A JSON Web Token has three parts with dots between; a key has no dot.
+    return Credential("token" if secret.count(".") == 2 else "key", secret)
 
 
 def check_page(request: Request) -> None:

@@ -1,9 +1,9 @@
-"""Authentication of requests: the key or the session, the key's rate limit, its scopes."""
+"""Authentication of requests: the key, the session or the token, its rate limit, its permissions."""
 
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import structlog
 from fastapi import Depends, FastAPI, Request
@@ -15,10 +15,14 @@ from specimap_service.app_state import AppState
 from specimap_service.auth.access import Access
 from specimap_service.auth.credentials import COOKIE, PAGE_HEADER, Credential, credential_of
 from specimap_service.auth.keys import KEPT_SECONDS, Keyring, Principal
+from specimap_service.auth.permissions import OPERATIONS, roles_for, scope_for
 from specimap_service.auth.rate_limit import Left, RateLimiter
 from specimap_service.context import ANSWER_HEADERS, AppContext
-from specimap_service.errors import ForbiddenError, RateLimitedError, UnauthorizedError
+from specimap_service.errors import ForbiddenError, IdentityUnavailableError, RateLimitedError, UnauthorizedError
 from specimap_service.feature import Feature
+
+if TYPE_CHECKING:
+    from specimap_service.auth.oidc.identity import Identity
 
 SESSION = "/v1/session"
 FAILURES_PER_MINUTE = 60
@@ -26,11 +30,20 @@ FAILURES_PER_MINUTE = 60
 KEYRING = AppState[Keyring]("keyring")
 LIMITER = AppState[RateLimiter]("limiter")
 ACCESS = AppState[Access]("access")
+IDENTITY: AppState[Identity | None] = AppState("identity")
+"""None where the service has no identity provider."""
 
 
 def _open(app: FastAPI, context: AppContext) -> None:
     settings = context.settings
-    KEYRING.set(app, Keyring(context.database, settings.rate_per_minute, settings.quota_bytes))
+    identity = None
+    if settings.oidc_issuer:
+        # Imported late: without a provider, nothing of its protocol is loaded.
+        from specimap_service.auth.oidc.identity import Identity
+
+        identity = Identity(settings, context.database)
+    IDENTITY.set(app, identity)
+    KEYRING.set(app, Keyring(context.database, settings.rate_per_minute, settings.quota_bytes, identity))
     LIMITER.set(app, RateLimiter())
     ACCESS.set(app, Access(context.database))
 
@@ -49,7 +62,7 @@ async def authenticated(request: Request) -> Principal:
         UnauthorizedError: there is no key, or no valid one. RateLimitedError: too many requests, or wrong keys.
         CrossSiteRequestError: it has a session's cookie, and may come from the page of another site.
         ForbiddenError: it comes by a share's link, and asks for anything but the share's cloud.
-        DatabaseUnavailableError: keys cannot be looked up.
+        DatabaseUnavailableError: keys cannot be looked up. IdentityUnavailableError: nor can the provider's.
     """
     found = await known_by(request, credential_of(request))
     check_shared(found, request.method, request.scope["path"])
@@ -111,20 +124,25 @@ def trust_of(request: Request) -> Callable[[], Awaitable[float | None]]:
             await run_in_threadpool(keyring.principal, credential)
         except UnauthorizedError:
             return None
-        except DatabaseUnavailableError:
+        except (DatabaseUnavailableError, IdentityUnavailableError):
             return KEPT_SECONDS
         return keyring.trusted_seconds(credential)
 
     return seconds
 
 
-_bearer = HTTPBearer(auto_error=False, scheme_name="key", description="`Authorization: Bearer spk_…`")
+_bearer = HTTPBearer(
+    auto_error=False,
+    scheme_name="key",
+    description="`Authorization: Bearer` with a key, `spk_…`, or with an access token of the identity provider.",
+)
 _cookie = APIKeyCookie(
     name=COOKIE,
     auto_error=False,
     scheme_name="session",
-    description="The cookie that `POST /v1/session` sets, for the service's own pages. It counts where there is no "
-    f"key. Requests that change something have the header `{PAGE_HEADER}: 1` with it.",
+    description="The cookie of a session, which `POST /v1/session` sets, or a sign-in with the identity provider, "
+    "for the service's own pages. It counts where there is no key. Requests that change something have the header "
+    f"`{PAGE_HEADER}: 1` with it.",
 )
 
 
@@ -142,23 +160,47 @@ async def known_principal(
 Known = Annotated[Principal, Depends(known_principal)]
 
 
-SCOPE_OF: dict[Callable[..., object], str] = {}
-"""The scope that each dependency made by :func:`requires` asks for, from which the API's description takes it."""
+def permission_of(operation: str) -> str | None:
+    """Return the permission that an operation asks for; None where every key, person and share will do.
+
+    Raises:
+        LookupError: the table does not say.
+    """
+    if operation not in OPERATIONS:
+        raise LookupError(f"service/specimap_service/auth/permissions.py does not say who may {operation}")
+    return OPERATIONS[operation]
 
 
-def requires(scope: str) -> Callable[..., Awaitable[Principal]]:
-    """Make a dependency: the request's principal, if its key has the scope. ``admin`` has all."""
+async def permitted(request: Request, found: Known) -> Principal:
+    """Return the request's principal, if it has the permission of the operation: a dependency.
 
-    async def principal(found: Known) -> Principal:
-        if not found.may(scope):
-            raise ForbiddenError(f"The key lacks the scope {scope!r}.", advice="Use a key that has it.", scope=scope)
-        return found
+    Raises:
+        ForbiddenError: it has not; details name the scope that the key lacks, or the permission of no role.
+    """
+    permission = permission_of(request.scope["route"].operation_id)
+    if permission is not None:
+        check_permission(found, permission)
+    return found
 
-    SCOPE_OF[principal] = scope
-    return principal
+
+def check_permission(principal: Principal, permission: str) -> None:
+    """Raise ForbiddenError unless a principal has a permission."""
+    if principal.may(permission):
+        return
+    if principal.is_person:
+        roles = " or ".join(roles_for(permission))
+        raise ForbiddenError(
+            f"Your role does not permit this: {permission}.",
+            advice=f"It takes the role {roles}; ask whoever manages the accounts.",
+            permission=permission,
+        )
+    scope = scope_for(permission)
+    raise ForbiddenError(f"The key lacks the scope {scope!r}.", advice="Use a key that has it.", scope=scope)
 
 
-Uploader = Annotated[Principal, Depends(requires("upload"))]
-Reader = Annotated[Principal, Depends(requires("read"))]
-Labeller = Annotated[Principal, Depends(requires("label"))]
-Admin = Annotated[Principal, Depends(requires("admin"))]
+Permitted = Annotated[Principal, Depends(permitted)]
+"""The principal of a request that the table of permissions permits."""
+Uploader = Permitted
+Reader = Permitted
+Labeller = Permitted
+Admin = Permitted

@@ -11,9 +11,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 
 from specimap_infra.database import utc_now
-from specimap_infra.projects import found_project
 from specimap_infra.tables import ApiKey, AuditEntry
-from specimap_service.auth.access import in_sight, load
+from specimap_service.auth.access import in_sight, load, project_for_new
 from specimap_service.auth.credentials import credential_of, is_secret_of
 from specimap_service.auth.dependencies import Admin, KeyringDep
 from specimap_service.auth.keys import checked_name, derived_secret, key_text, new_key
@@ -37,7 +36,9 @@ class KeyRequest(BaseModel):
     name: Annotated[str, AfterValidator(checked_name)] = Field(
         min_length=1, max_length=100, description="Whose key it is; no patient's name. No control characters."
     )
-    scopes: list[Literal["upload", "read", "label", "intraoperative", "admin"]] = Field(min_length=1, fail_fast=True)
+    scopes: list[Literal["upload", "read", "label", "intraoperative", "audit", "admin"]] = Field(
+        min_length=1, fail_fast=True
+    )
     project: str | None = Field(
         default=None,
         pattern=r"^[A-Za-z0-9._-]{1,64}$",
@@ -74,7 +75,7 @@ class NewKey(Key):
 
 
 class Audited(BaseModel):
-    """An entry of the audit trail: which key did what to which object."""
+    """An entry of the audit trail: which key or person did what to which object."""
 
     model_config = ConfigDict(title="AuditEntry", from_attributes=True)
 
@@ -107,7 +108,7 @@ def create_key(
     own = credential_of(request)
 
     def make(session: Session, salt: str) -> tuple[str, NewKey]:
-        project_id = principal.project_id if wanted.project is None else found_project(session, wanted.project).id
+        project_id = project_for_new(session, principal, wanted.project)
         row, key = new_key(
             wanted.name,
             wanted.scopes,
@@ -170,7 +171,7 @@ def list_audit(
     context: Context,
     principal: Admin,
     target: Annotated[
-        str | None, Query(pattern=r"^[a-z]{2,5}_[0-9a-z]{26}$", description="Only entries about this object.")
+        str | None, Query(pattern=r"^[a-z]{2,6}_[0-9a-z]{26}$", description="Only entries about this object.")
     ] = None,
     project: InProject = None,
     after: Annotated[int | None, Query(ge=1, le=10**18, description="`next` of the page before.")] = None,

@@ -10,12 +10,12 @@ from sqlalchemy.orm import Session
 
 from specimap_infra.database import utc_now
 from specimap_infra.ids import new_id
-from specimap_infra.tables import ApiKey, Share
+from specimap_infra.tables import ApiKey, Person, Share
 from specimap_service.auth.credentials import secret_hash
 
 PREFIX = "sps"
 MOST_DAYS = 90
-SCOPES = frozenset({"read"})
+SCOPES = ("read",)
 """What a share permits, on its cloud alone."""
 
 
@@ -51,8 +51,10 @@ def share_of(session: Session, token: str) -> Share | None:
     return row if same else None
 
 
-def maker_of(session: Session, share: Share) -> ApiKey | None:
-    """Return the key that made a share, which ends with it."""
+def maker_of(session: Session, share: Share) -> ApiKey | Person | None:
+    """Return the key or the person that made a share, which ends with it."""
+    if share.created_by.startswith("person_"):
+        return session.get(Person, share.created_by)
     return session.get(ApiKey, share.created_by)
 
 

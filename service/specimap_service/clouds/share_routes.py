@@ -14,13 +14,13 @@ from specimap_infra import tables
 from specimap_infra.database import utc_now
 from specimap_service.auth.access import load, not_found
 from specimap_service.auth.credentials import credential_of, is_secret_of
-from specimap_service.auth.dependencies import KeyringDep, Uploader
+from specimap_service.auth.dependencies import KeyringDep, Uploader, check_permission
 from specimap_service.auth.keys import checked_name, derived_secret
 from specimap_service.auth.object_ids import CloudId, ShareId
+from specimap_service.auth.permissions import READ
 from specimap_service.auth.shares import MOST_DAYS, new_share, share_text
 from specimap_service.context import Context, audit
 from specimap_service.errors import (
-    ForbiddenError,
     IdempotencyConflictError,
     QuotaExceededError,
     RequestInvalidError,
@@ -83,10 +83,8 @@ def create_share(
 
     `POST /v1/session` takes the token. The share ends when it expires or is revoked, and with the key that made it.
     """
-    if not principal.may("read"):
-        raise ForbiddenError(
-            "The key lacks the scope 'read', which the share would give.", advice="Use a key that has it.", scope="read"
-        )
+    # Nobody gives what they have not.
+    check_permission(principal, READ)
     _check_end(wanted.expires_at)
     own = credential_of(request)
 

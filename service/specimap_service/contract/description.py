@@ -12,7 +12,8 @@ from fastapi.routing import APIRoute, RouteContext, iter_route_contexts
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
-from specimap_service.auth.dependencies import SCOPE_OF
+from specimap_service.auth.dependencies import known_principal, permission_of, permitted
+from specimap_service.auth.permissions import roles_for, scope_for
 from specimap_service.contract.events import describe_events
 from specimap_service.contract.examples import add_examples
 from specimap_service.contract.headers import describe_headers
@@ -78,23 +79,33 @@ def _complete(app: FastAPI, contract: dict[str, Any]) -> None:
                 parameter |= {"required": True, "schema": NEEDED[parameter["name"]]}
         if route.summary is None:
             operation["summary"] = re.split(r"[.:;] ", operation["description"].strip().rstrip(".") + ". ")[0]
-        scope = scope_of(route)
-        if scope is not None:
+        permission = checked_permission(route, operation["operationId"])
+        if permission is not None:
+            scope = scope_for(permission)
             # OpenAPI 3.1 lets every kind of scheme name what it needs here, not only OAuth 2.
             operation["security"] = [{name: [scope] for name in need} for need in operation["security"]]
-            note = f"Scope: `{scope}`."
+            operation["x-permission"] = permission
+            roles = ", ".join(f"`{role}`" for role in roles_for(permission))
+            note = f"Permission: `{permission}`, of keys with the scope `{scope}`, and of the roles {roles}."
             operation["description"] = f"{operation.get('description', '')}\n\n{note}".strip()
         describe_headers(operation)
         refusals.add(method, path, operation)
         describe_events(operation)
 
 
-def scope_of(route: RouteContext) -> str | None:
-    """Return the scope that a route's dependencies ask for; None where they ask for no key."""
-    found = {SCOPE_OF[call] for call in _calls(route.dependant) if call in SCOPE_OF}
-    if len(found) > 1:
-        raise ValueError(f"{route.path} asks for several scopes: {sorted(found)}")
-    return next(iter(found), None)
+def checked_permission(route: RouteContext, operation: str) -> str | None:
+    """Return the permission that an operation asks for; None where every key will do, or none is needed.
+
+    Raises:
+        ValueError: its route takes a key and does not ask whether that has the permission.
+    """
+    calls = set(_calls(route.dependant))
+    if known_principal not in calls:
+        return None
+    permission = permission_of(operation)
+    if permission is not None and permitted not in calls:
+        raise ValueError(f"{route.path} does not check {permission}: declare its principal as Permitted")
+    return permission
 
 
 def _calls(dependant: Dependant) -> Iterator[Any]:

@@ -40,6 +40,7 @@ _TUS: tuple[Refusal, ...] = (
 )
 
 OWN: dict[str, tuple[Refusal, ...]] = {
+    "acquisitions.create": (core.NotFoundError,),
     "acquisitions.delete": (infra.JobConflictError, infra.StorageUnavailableError),
     "acquisitions.get_viewpoints": _TURNS,
     "clouds.get": _CLOUD,
@@ -104,6 +105,8 @@ OWN: dict[str, tuple[Refusal, ...]] = {
     "spectra.select": (*_ARRAYS, *_TURNS),
     "studies.get": (infra.StudyKeysMissingError, infra.StudySealedError),
     "studies.put": (infra.StudyKeysMissingError, infra.StudySealedError),
+    "sso.get_start": (service.SignInUnknownError, service.CrossSiteRequestError, service.RateLimitedError),
+    "sso.get_callback": (service.SignInUnknownError, service.RateLimitedError),
     "uploads.create": (
         (412, service.RequestInvalidError),
         core.NotFoundError,
@@ -138,7 +141,8 @@ def common(method: str, path: str, operation: dict[str, Any]) -> Iterable[Refusa
     # Even without parameters: those in a query that it does not know are refused.
     yield service.RequestInvalidError
     if operation.get("security"):
-        yield from (service.UnauthorizedError, service.ForbiddenError, service.RateLimitedError)
+        yield from (service.UnauthorizedError, service.TokenInvalidError, service.TokenExpiredError)
+        yield from (service.ForbiddenError, service.RateLimitedError, service.IdentityUnavailableError)
         # A browser may say of any request that another site's page made it.
         yield service.CrossSiteRequestError
     if path != "/healthz":

@@ -20,6 +20,7 @@ from specimap_infra.tables import FINAL_STATES, PRIORITIES, Acquisition, Job
 from specimap_infra.webhooks import check_target
 from specimap_service.auth.access import load, not_found
 from specimap_service.auth.keys import Principal
+from specimap_service.auth.permissions import URGENT
 from specimap_service.clouds.open_clouds import OpenClouds
 from specimap_service.context import AppContext, audit, correlation_id
 from specimap_service.errors import ForbiddenError, UploadIncompleteError
@@ -130,7 +131,7 @@ def _create_once(
 
 def _check_priority(principal: Principal, priority: int) -> None:
     """Raise ForbiddenError where a key asks for theatre's place in the queue without the right to it."""
-    if priority == PRIORITIES["intraoperative"] and not principal.may("intraoperative"):
+    if priority == PRIORITIES["intraoperative"] and not principal.may(URGENT):
         raise ForbiddenError(
             "The key may not create jobs of the priority intraoperative.",
             advice="Ask for the priority routine, or use a key that has the scope intraoperative.",

@@ -31,7 +31,7 @@ export default function AcquisitionPage({ parts }: { parts: readonly string[] })
       </p>
       {acquisition.notes && <p>{acquisition.notes}</p>}
       {!acquisition.ready && <p class="box warning">{t("missing", { what: acquisition.missing.join(", ") })}</p>}
-      {may("upload") && (
+      {may("capture.write") && (
         <div class="row">
           <a class="button" href={href(["capture", id])}>
             {t("capture")}
@@ -81,7 +81,7 @@ export default function AcquisitionPage({ parts }: { parts: readonly string[] })
               )}
             </td>
             <td>
-              {may("upload") && (
+              {may("capture.write") && (
                 <Action
                   text={common("delete")}
                   kind="danger"
@@ -98,7 +98,7 @@ export default function AcquisitionPage({ parts }: { parts: readonly string[] })
           </>
         )}
       />
-      {may("upload") && (
+      {may("capture.write") && (
         <p>
           <Action
             text={t("remove")}

@@ -14,7 +14,7 @@ export default function AcquisitionsPage() {
     <div class="page">
       <h1>{t("title")}</h1>
       <div class="row">
-        {may("upload") && (
+        {may("capture.write") && (
           <a class="button primary" href={href(["capture"])} data-testid="new-acquisition">
             {t("new")}
           </a>

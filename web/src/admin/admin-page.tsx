@@ -11,10 +11,10 @@ import { byLabel, parseMetrics, valueOf } from "./metrics";
 import { Projects } from "./projects";
 import { t } from "./texts";
 
-/** Keys, projects, workers, queue, storage and the audit trail; for administrators. */
+/** Keys, projects, workers, queue and storage, for administrators; the audit trail, for auditors too. */
 export default function AdminPage() {
-  if (!may("admin")) {
-    const refused = new Problem("forbidden", "The key lacks the scope 'admin'.", "", 403, { scope: "admin" });
+  if (!may("audit.read")) {
+    const refused = new Problem("forbidden", "This is for administrators.", "", 403, { permission: "key.manage" });
     return (
       <div class="page">
         <ProblemBox problem={refused} />
@@ -23,10 +23,10 @@ export default function AdminPage() {
   }
   return (
     <div class="page">
-      <h1>{t("title")}</h1>
-      <ServiceState />
-      <Keys />
-      <Projects />
+      {may("key.manage") && <h1>{t("title")}</h1>}
+      {may("service.watch") && <ServiceState />}
+      {may("key.manage") && <Keys />}
+      {may("project.manage") && <Projects />}
       <h2>{t("audit")}</h2>
       <PagedTable<Schemas["AuditEntry"]>
         name="audit"

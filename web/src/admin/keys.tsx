@@ -9,7 +9,7 @@ import { PagedTable } from "../ui/paged";
 import { t } from "./texts";
 import { copyText } from "../ui/browser";
 
-const SCOPES = ["upload", "read", "label", "intraoperative", "admin"] as const;
+const SCOPES = ["upload", "read", "label", "intraoperative", "audit", "admin"] as const;
 type KeyRequest = Schemas["KeyRequest"];
 
 /** Keys: listed, created (the key itself is shown once), revoked. */

@@ -1,9 +1,20 @@
 /** The signed-in session: a signal that all pages read. */
 import { signal } from "@preact/signals";
-import { api, body, onSignedOut, type Schemas } from "../api/client";
+import { api, BASE, body, onSignedOut, type Schemas } from "../api/client";
 import { asProblem, type Problem } from "../api/problem";
 
 export type Session = Schemas["Session"];
+export type Permission =
+  | "audit.read"
+  | "capture.write"
+  | "job.run"
+  | "job.urgent"
+  | "key.manage"
+  | "label.write"
+  | "project.manage"
+  | "result.read"
+  | "service.watch"
+  | "share.manage";
 
 /** `undefined`: not known yet. `null`: nobody is signed in. */
 export const session = signal<Session | null | undefined>(undefined);
@@ -52,12 +63,27 @@ export async function signIn(with_: { key: string } | { share: string }): Promis
   return made;
 }
 
-/** Sign out here; the cookie is worth nothing afterwards. */
+/** Sign out here, and at the identity provider where the account is one of its; the cookie is worth nothing afterwards. */
 export async function signOut(): Promise<void> {
-  await api.DELETE("/v1/session").catch(() => undefined);
+  const elsewhere = isPerson()
+    ? await body(api.POST("/v1/sso/logout")).then((answer) => answer.end_session_url, () => null)
+    : null;
+  if (elsewhere === null) await api.DELETE("/v1/session").catch(() => undefined);
   sessionLost.value = false;
   before.set(false);
   session.value = null;
+  if (elsewhere !== null) location.assign(elsewhere);
+}
+
+/** Sign in with the account of the identity provider: the browser leaves, and comes back to the page that is shown. */
+export function signInElsewhere(): void {
+  before.set(true);
+  location.assign(`${BASE}/v1/sso/login?${new URLSearchParams({ return_to: location.hash.slice(1) }).toString()}`);
+}
+
+/** Whether somebody is signed in with the account of the identity provider. */
+export function isPerson(): boolean {
+  return session.value?.key_id.startsWith("person_") ?? false;
 }
 
 function tried<T>(act: () => T): T | undefined {
@@ -69,8 +95,7 @@ function tried<T>(act: () => T): T | undefined {
   }
 }
 
-/** Whether the session's key has a scope; an administrator's has all. */
-export function may(scope: string): boolean {
-  const scopes = session.value?.scopes ?? [];
-  return scopes.includes("admin") || scopes.includes(scope);
+/** Whether the session has a permission of docs/identity.md. */
+export function may(permission: Permission): boolean {
+  return session.value?.permissions.includes(permission) ?? false;
 }

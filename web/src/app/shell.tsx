@@ -3,7 +3,7 @@ import type { ComponentChildren } from "preact";
 import { chooseLanguage, language, LANGUAGES, type Language } from "../i18n";
 import { t } from "../i18n/common";
 import { href, path } from "./route";
-import { may, session, signOut } from "./session";
+import { isPerson, may, session, signOut } from "./session";
 
 const LINKS = [
   { parts: [], text: "acquisitions", first: ["", "acquisitions", "capture"] },
@@ -23,20 +23,25 @@ export function Shell({ children }: { children: ComponentChildren }) {
         </a>
         {session.value && !shared && (
           <nav aria-label="Specimap">
-            {LINKS.map(({ parts, text, first }) => (
+            {may("result.read") && LINKS.map(({ parts, text, first }) => (
               <a href={href(parts)} aria-current={(first as readonly string[]).includes(here) ? "page" : undefined}>
                 {t(text)}
               </a>
             ))}
-            {may("admin") && (
+            {(may("key.manage") || may("audit.read")) && (
               <a href={href(["admin"])} aria-current={here === "admin" ? "page" : undefined}>
-                {t("administration")}
+                {may("key.manage") ? t("administration") : t("audit")}
               </a>
             )}
           </nav>
         )}
         <span class="fill" />
         <LanguageChoice />
+        {isPerson() && (
+          <span class="small" data-testid="roles">
+            {session.value?.roles.map(roleName).join(", ")}
+          </span>
+        )}
         {session.value && (
           <button type="button" class="quiet" onClick={() => void signOut()} title={session.value.name}>
             {t("signOut")}
@@ -48,6 +53,18 @@ export function Shell({ children }: { children: ComponentChildren }) {
     </div>
   );
 }
+
+function roleName(role: string): string {
+  return role in ROLES ? t(ROLES[role as keyof typeof ROLES]) : role;
+}
+
+const ROLES = {
+  technician: "technician",
+  clinician: "clinician",
+  classifier: "classifier",
+  admin: "administrator",
+  auditor: "auditor",
+} as const;
 
 function LanguageChoice() {
   return (

@@ -2,7 +2,7 @@ import { useState } from "preact/hooks";
 import { api, body, type Schemas } from "../api/client";
 import { asProblem, type Problem } from "../api/problem";
 import { go } from "../app/route";
-import { may } from "../app/session";
+import { may, session } from "../app/session";
 import { ProblemBox } from "../ui/boxes";
 import { Barcode } from "./barcode";
 import { PATTERN } from "./specimen-id";
@@ -63,6 +63,7 @@ export function NewAcquisition() {
       dictionary: (text("dictionary") || "DICT_4X4_50") as Dictionary,
       edge_mm: Number(text("edge")),
       notes: text("notes"),
+      ...(text("project") ? { project: text("project") } : {}),
     };
     setBusy(true);
     setProblem(null);
@@ -80,7 +81,8 @@ export function NewAcquisition() {
     }
   };
 
-  if (!may("upload")) return <p class="page box warning">{t("noUpload")}</p>;
+  const projects = session.value?.projects ?? [];
+  if (!may("capture.write")) return <p class="page box warning">{t("noUpload")}</p>;
   return (
     <form class="page narrow capture-new" onSubmit={(event) => void submit(event)} data-testid="new-acquisition">
       <h1>{t("new")}</h1>
@@ -103,6 +105,16 @@ export function NewAcquisition() {
         {t("specimenHint")}
       </p>
       <Barcode found={setSpecimen} />
+      {projects.length > 1 && (
+        <>
+          <label for="project">{t("project")}</label>
+          <select id="project" name="project">
+            {projects.map(({ id, name }) => (
+              <option value={id}>{name}</option>
+            ))}
+          </select>
+        </>
+      )}
       {/* The browser shows what is wrong with a field only where the field is seen. */}
       <details onInvalidCapture={(event) => (event.currentTarget.open = true)}>
         <summary>

@@ -68,7 +68,8 @@ const en = {
   full: "The service has no room left for your files. Nothing is lost: they wait here. Tell whoever runs the service.",
   forgetful: "This browser keeps no files (a private window, or a full disk). Do not close this page until all are sent.",
   elsewhere: "Another tab of this browser sends the files. Close it to send from here.",
-  noUpload: "Your key may not send files. It lacks the right “upload”.",
+  noUpload: "You may not send files: your key lacks the right “upload”, or your role does not permit it.",
+  project: "Project",
 
   count: "{n} of {of} photos",
   enough: "Enough photos: the dome is covered.",
@@ -218,7 +219,8 @@ const it: typeof en = {
   full: "Il servizio non ha più spazio per i tuoi file. Nulla va perso: aspettano qui. Avvisa chi gestisce il servizio.",
   forgetful: "Questo browser non conserva file (finestra privata o disco pieno). Non chiudere la pagina finché non sono stati inviati tutti.",
   elsewhere: "I file vengono inviati da un'altra scheda di questo browser. Chiudila per inviare da qui.",
-  noUpload: "La tua chiave non può inviare file: manca il diritto “upload”.",
+  noUpload: "Non puoi inviare file: alla tua chiave manca il diritto “upload”, o il tuo ruolo non lo permette.",
+  project: "Progetto",
 
   count: "{n} foto su {of}",
   enough: "Le foto bastano: la cupola è coperta.",

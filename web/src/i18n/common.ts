@@ -5,6 +5,12 @@ const en = {
   jobs: "Jobs",
   results: "Results",
   administration: "Administration",
+  audit: "Audit trail",
+  technician: "Technician",
+  clinician: "Clinician",
+  classifier: "Classifier",
+  administrator: "Administrator",
+  auditor: "Auditor",
   signOut: "Sign out",
   language: "Language",
   research: "For research use only. Not a medical device.",
@@ -22,6 +28,7 @@ const en = {
   reload: "Reload",
   goTo: "Go to {what}",
   noRight: "Your key may not do this. It lacks the right “{scope}”.",
+  noPermission: "Your role does not permit this: {permission}.",
 };
 export type CommonKey = keyof typeof en;
 const it: typeof en = {
@@ -29,6 +36,12 @@ const it: typeof en = {
   jobs: "Elaborazioni",
   results: "Risultati",
   administration: "Amministrazione",
+  audit: "Registro degli accessi",
+  technician: "Tecnico",
+  clinician: "Medico",
+  classifier: "Classificatore",
+  administrator: "Amministratore",
+  auditor: "Revisore",
   signOut: "Esci",
   language: "Lingua",
   research: "Solo per ricerca. Non è un dispositivo medico.",
@@ -46,5 +59,6 @@ const it: typeof en = {
   reload: "Ricarica",
   goTo: "Vai a {what}",
   noRight: "La tua chiave non lo permette: manca il diritto “{scope}”.",
+  noPermission: "Il tuo ruolo non lo permette: {permission}.",
 };
 export const t = texts({ en, it });

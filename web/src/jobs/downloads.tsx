@@ -47,7 +47,7 @@ export function Downloads({ cloud }: { cloud: string }) {
               </span>
             );
           }
-          if (!may("read")) return null;
+          if (!may("result.read")) return null;
           return (
             <Action
               text={`${t("prepare")} ${what}`}

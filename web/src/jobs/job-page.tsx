@@ -57,7 +57,7 @@ export function JobPage({ id }: { id: string }) {
       )}
       {job.state === "succeeded" && <ReportSection job={id} />}
       {job.cloud_id && <Downloads cloud={job.cloud_id} />}
-      {may("upload") && (
+      {may("job.run") && (
         <div class="row">
           {!ended && (
             <Action

@@ -14,13 +14,15 @@ export function Loading() {
 
 /** A refusal in the service's words, with its advice and code; the loss of the connection in ours. */
 export function ProblemBox({ problem, again }: { problem: Problem; again?: (() => void) | undefined }) {
-  const details = problem.details as { scope?: unknown };
+  const details = problem.details as { scope?: unknown; permission?: unknown };
   const text =
     problem.status === 0 && problem.code === "network_lost"
       ? t("networkLost")
       : problem.code === "forbidden" && typeof details.scope === "string"
         ? t("noRight", { scope: details.scope })
-        : problem.message;
+        : problem.code === "forbidden" && typeof details.permission === "string"
+          ? t("noPermission", { permission: details.permission })
+          : problem.message;
   return (
     <div class="box problem" role="alert">
       <p>{text}</p>

@@ -29,12 +29,12 @@ const own = (): boolean => session.value?.cloud_id == null;
 
 /** Parts that are loaded when they are first opened. */
 const PANELS: LazyPanel[] = [
-  { name: "labels", load: () => import("./labels/label-panel"), allowed: () => own() && may("label") },
+  { name: "labels", load: () => import("./labels/label-panel"), allowed: () => own() && may("label.write") },
   { name: "measure", load: () => import("./measure/measure-panel") },
   { name: "cameras", load: () => import("./cameras/camera-panel") },
   { name: "top", load: () => import("./top/top-panel") },
   { name: "figure", load: () => import("./figure/figure-panel") },
-  { name: "share", load: () => import("./share/share-panel"), allowed: () => own() && may("upload") && may("read") },
+  { name: "share", load: () => import("./share/share-panel"), allowed: () => own() && may("share.manage") && may("result.read") },
   { name: "quality", load: () => import("./panels/quality-panel") },
 ];
 

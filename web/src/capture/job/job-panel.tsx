@@ -51,7 +51,7 @@ export function JobPanel({ acquisition, enough, onTheWay, retake }: Props) {
   };
   const start = (): Promise<void> =>
     act(async () => {
-      const priority = may("intraoperative") && urgent ? "intraoperative" : "routine";
+      const priority = may("job.urgent") && urgent ? "intraoperative" : "routine";
       const params = { header: { "idempotency-key": token } };
       await body(api.POST("/v1/jobs", { body: { acquisition_id: acquisition.id, priority }, params }));
     });
@@ -101,7 +101,7 @@ function Start({ acquisition: { ready, files }, enough, onTheWay, busy, before, 
           {t("missing", { what: what.join(", ") })}
         </p>
       )}
-      {may("intraoperative") && (
+      {may("job.urgent") && (
         <label class="check">
           <input type="checkbox" checked={urgent} onChange={(event) => setUrgent(event.currentTarget.checked)} /> {t("urgent")}
         </label>

@@ -1,0 +1,1 @@
+"""Sign-in with an identity provider by OpenID Connect: loaded only where one is configured."""
