@@ -21,6 +21,8 @@ from sqlalchemy.orm import InstrumentedAttribute, Session, aliased
 
 from specimap_core.atomic import remove
 from specimap_core.errors import SpecimapError
+from specimap_infra.audit.pruning import prune
+from specimap_infra.audit.records import ChainKeys
 from specimap_infra.database import Database, rows_changed, utc_now
 from specimap_infra.logs import logger
 from specimap_infra.schema_version import engine_schema
@@ -171,7 +173,8 @@ class Housekeeping:
         return self._rows(Delivery.id, sa.and_(Delivery.state != "pending", Delivery.next_at < before))
 
     def _audit(self, before: datetime.datetime) -> int:
-        return self._rows(AuditEntry.id, AuditEntry.at < before)
+        forwarded_to = self._settings.audit_syslog
+        return prune(self._database, ChainKeys.of(self._settings), before, forwarded_to)
 
     def _requests(self, before: datetime.datetime) -> int:
         """Names of requests that may be sent again no longer."""

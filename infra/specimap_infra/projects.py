@@ -73,6 +73,14 @@ def project_of(session: Session, object_id: str) -> str | None:
     return session.scalar(_OWNERS[kind].where(_IDS[kind] == object_id))
 
 
+def acquisition_of(session: Session, object_id: str) -> str | None:
+    """Return the acquisition that an object belongs to; None where it belongs to none, or is not there."""
+    kind = object_id.partition("_")[0]
+    if kind in ("prj", "key") or kind not in _OWNERS:
+        return None
+    return session.scalar(_OWNERS[kind].with_only_columns(Acquisition.id).where(_IDS[kind] == object_id))
+
+
 def within(table: type[Base], projects: sa.Select[str] | str) -> sa.ColumnElement[bool]:
     """Make the condition that rows of a table belong to a project, given by its id or a query for one id."""
     # Not `in`, with which SQLite would sort all that a large project has for each page.

@@ -10,6 +10,7 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 
 from specimap_core.errors import SettingsError
 from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES, backends_from
+from specimap_infra.settings.audit import AuditSettings
 from specimap_infra.settings.logging import LogSettings
 from specimap_infra.settings.places import PlaceSettings
 from specimap_infra.settings.retention import RetentionSettings
@@ -30,6 +31,7 @@ def _config_file() -> Path | None:
 class ServiceSettings(
     # The last one's fields come first.
     LogSettings,
+    AuditSettings,
     RetentionSettings,
     WebhookSettings,
     WorkerSettings,

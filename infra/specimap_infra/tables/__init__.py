@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from specimap_infra.tables.access import ApiKey, AuditEntry, Project, Share, SignIn
+from specimap_infra.tables.access import ApiKey, Project, Share, SignIn
 from specimap_infra.tables.acquisitions import Acquisition, StoredFile, Upload, UploadPart
+from specimap_infra.tables.audit import AuditCursor, AuditEntry, AuditHead
 from specimap_infra.tables.base import Base, UtcDateTime
 from specimap_infra.tables.clouds import CloudRow, Export, LabelVersion
 from specimap_infra.tables.jobs import Artefact, Delivery, Job, JobEvent, Lease, RepeatableRequest
@@ -19,7 +20,9 @@ __all__ = [
     "Acquisition",
     "ApiKey",
     "Artefact",
+    "AuditCursor",
     "AuditEntry",
+    "AuditHead",
     "Base",
     "CloudRow",
     "Delivery",
