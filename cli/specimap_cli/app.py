@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from specimap_cli import run_options
+from specimap_cli.audit import audit_app
 from specimap_cli.backup import backup, restore
 from specimap_cli.doctor import doctor
 from specimap_cli.errors import Debug, reported_errors, stoppable
@@ -224,3 +225,4 @@ app.add_typer(study_app, name="study")
 app.add_typer(keys_app, name="keys")
 app.add_typer(projects_app, name="projects")
 app.add_typer(storage_app, name="storage")
+app.add_typer(audit_app, name="audit")

@@ -63,3 +63,15 @@ class RestoreTargetError(SpecimapError, FileExistsError):
     """A backup would be restored over data."""
 
     code = "restore_target_not_empty"
+
+
+class SyslogUnavailableError(SpecimapError, RuntimeError):
+    """The syslog server cannot be reached, or did not take what it was sent."""
+
+    code = "syslog_unavailable"
+
+
+class LegalHoldError(SpecimapError, PermissionError):
+    """A legal hold keeps the acquisition from being deleted, whoever asks; ``details['acquisition_id']``."""
+
+    code = "legal_hold"

@@ -21,6 +21,7 @@ from sqlalchemy.orm import InstrumentedAttribute, Session, aliased
 
 from specimap_core.atomic import remove
 from specimap_core.errors import SpecimapError
+from specimap_infra.audit.entries import name_digest, new_entry
 from specimap_infra.audit.pruning import prune
 from specimap_infra.audit.records import ChainKeys
 from specimap_infra.database import Database, rows_changed, utc_now
@@ -227,29 +228,14 @@ class Housekeeping:
             )
             .scalar_subquery()
         )
-        query = (
-            sa.select(LabelVersion, Acquisition.project_id)
-            .join(CloudRow, CloudRow.id == LabelVersion.cloud_id)
-            .join(Acquisition, Acquisition.id == CloudRow.acquisition_id)
-            .where(newer >= self._settings.keep_label_versions)
-            .limit(BATCH)
-        )
+        query = sa.select(LabelVersion).where(newer >= self._settings.keep_label_versions).limit(BATCH)
         with self._database.session() as session:
-            rows = session.execute(query).all()
-            for label, project in rows:
-                details = {"layer": label.name, "version": label.version}
-                session.add(
-                    AuditEntry(
-                        key_id=AUDITED_AS,
-                        project_id=project,
-                        action="label.expire",
-                        target=label.cloud_id,
-                        details=details,
-                        correlation_id="",
-                    )
-                )
+            labels = session.scalars(query).all()
+            for label in labels:
+                details = {"layer": name_digest(label.cloud_id, label.name), "version": label.version}
+                new_entry(session, AUDITED_AS, "label.expire", label.cloud_id, details)
                 session.delete(label)
-            prefixes = [label.storage_prefix for label, _ in rows]
+            prefixes = [label.storage_prefix for label in labels]
         return self._delete(prefixes)
 
     def _delete(self, keys: list[str]) -> int:

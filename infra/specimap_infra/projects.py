@@ -70,6 +70,8 @@ _IDS = {
 def project_of(session: Session, object_id: str) -> str | None:
     """Return the project of the object with an id of any kind; None where there is no such object."""
     kind = object_id.partition("_")[0]
+    if kind not in _OWNERS:
+        return None
     return session.scalar(_OWNERS[kind].where(_IDS[kind] == object_id))
 
 

@@ -51,12 +51,13 @@ def _seal_some(database: Database, keys: ChainKeys) -> int:
         query = sa.select(*_COLUMNS).where(AuditEntry.seq.is_(None)).order_by(AuditEntry.id).limit(BATCH)
         changes = []
         seq, previous = head.seq, head.hash
-        for row in session.execute(query).mappings():
+        for row in map(dict, session.execute(query).mappings()):
             seq += 1
             found = keys.hash_of(canonical(row, seq, previous))
             changes.append({"entry": row["id"], "seq": seq, "previous_hash": previous, "hash": found})
             previous = found
         if changes:
-            session.connection().execute(sa.update(_TABLE).where(_TABLE.c.id == sa.bindparam("entry")), changes)
+            in_place = sa.update(AuditEntry).where(_TABLE.c.id == sa.bindparam("entry"))
+            session.connection().execute(in_place, changes)
         head.seq, head.hash = seq, previous
         return len(changes)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import sqlalchemy as sa
 from sqlalchemy.orm import Session
@@ -43,7 +43,9 @@ class Anchor:
         found = re.fullmatch(r"(\d{1,18}):((?:sha256|hmac-sha256:[0-9a-f]{12}):[0-9a-f]{64}|0{64})", text.strip())
         if found is None:
             raise SettingsError(
-                "The anchor does not read.", advice="Give what `specimap audit head` printed, SEQ:HASH.", setting="anchor"
+                "The anchor does not read.",
+                advice="Give what `specimap audit head` printed, SEQ:HASH.",
+                setting="anchor",
             )
         return cls(int(found[1]), found[2])
 
@@ -124,17 +126,19 @@ class _Walk:
             .order_by(table.c.seq)
             .execution_options(yield_per=BATCH)
         )
-        for row in self._session.execute(query).mappings():
+        for row in map(dict, self._session.execute(query).mappings()):
             if (fault := self._step(row)) is not None:
                 return fault
             if self.count % BATCH == 0:
                 progress(self.count / max(1, self._head.seq - self._head.pruned_seq))
         return None
 
-    def _step(self, row: sa.RowMapping) -> Fault | None:
+    def _step(self, row: dict[str, Any]) -> Fault | None:
         seq, expected = int(row["seq"]), self.seq + 1
         if row["previous_hash"] != self._previous:
-            after = sa.select(AuditEntry.seq).where(AuditEntry.previous_hash == self._previous, AuditEntry.seq > expected)
+            after = sa.select(AuditEntry.seq).where(
+                AuditEntry.previous_hash == self._previous, AuditEntry.seq > expected
+            )
             elsewhere = self._session.scalar(after.limit(1))
             if elsewhere is not None:
                 return Fault("reordered", expected, f"the record that follows {self.seq} stands at {elsewhere}")

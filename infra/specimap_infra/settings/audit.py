@@ -40,7 +40,8 @@ class AuditSettings(BaseModel):
         default="dicom", description="What is forwarded: DICOM audit messages (PS3.15 A.5, XML), or lines of JSON."
     )
     audit_syslog_ca: Path | None = Field(
-        default=None, description="PEM file of the authorities that the syslog server's certificate is checked against; by default the system's."
+        default=None,
+        description="PEM file of the authorities that the syslog server's certificate is checked against; by default the system's.",
     )
     audit_syslog_certificate: Path | None = Field(
         default=None, description="PEM file with the certificate, and its key, that is shown to the syslog server."

@@ -12,6 +12,7 @@ from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBea
 
 from specimap_infra.errors import DatabaseUnavailableError
 from specimap_service.app_state import AppState
+from specimap_service.audit_note import NOTE
 from specimap_service.auth.access import Access
 from specimap_service.auth.credentials import COOKIE, PAGE_HEADER, Credential, credential_of
 from specimap_service.auth.keys import KEPT_SECONDS, Keyring, Principal
@@ -87,6 +88,8 @@ async def known_by(request: Request, credential: Credential) -> Principal:
         address = request.client.host if request.client else "unknown"
         limiter.take(f"address:{address}", FAILURES_PER_MINUTE)
         raise
+    if (note := NOTE.get()) is not None:
+        note.actor, note.project_id, note.session_id = found.key_id, found.project_id, found.session_id or ""
     try:
         left = limiter.take(found.key_id, found.rate_per_minute)
     except RateLimitedError as error:

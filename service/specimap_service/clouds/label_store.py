@@ -18,6 +18,7 @@ from specimap_core.atomic import disk_errors, remove
 from specimap_core.cloud.labels import describe_label, write_label
 from specimap_core.errors import NotFoundError
 from specimap_core.json_text import json_text
+from specimap_infra.audit.entries import name_digest
 from specimap_infra.errors import DatabaseUnavailableError
 from specimap_infra.labels import lock_cloud
 from specimap_infra.storage import Storage
@@ -125,7 +126,8 @@ def put_label(
                     created_by=principal.key_id,
                 )
                 session.add(row)
-                audit(session, principal.key_id, "label.put", cloud_id, layer=name, version=version)
+                layer = name_digest(cloud_id, name)
+                audit(session, principal.key_id, "label.put", cloud_id, layer=layer, version=version)
                 session.flush()
                 _publish(context.storage, work, prefix, {**stored, "version": version})
         except DatabaseUnavailableError:
@@ -175,7 +177,8 @@ def delete_label(
             raise no_label(cloud_id, name)
         conditions.check(session.scalar(sa.select(sa.func.max(LabelVersion.version)).where(layer)))
         session.execute(sa.delete(LabelVersion).where(layer))
-        audit(session, principal.key_id, "label.delete", cloud_id, layer=name, versions=len(prefixes))
+        digest = name_digest(cloud_id, name)
+        audit(session, principal.key_id, "label.delete", cloud_id, layer=digest, versions=len(prefixes))
     clouds.forget(cloud_id)
     for prefix in prefixes:
         context.storage.delete(prefix)
