@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
+from pydantic import SecretStr
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
@@ -35,6 +36,10 @@ def page_part() -> str:
     return f"{settings_table()}\n\n{OF_BACKENDS}\n\n{backends_table()}"
 
 
+FILES = ("_ca", "_certificate", "_key")
+"""Endings of the names of settings that name a file."""
+
+
 def _row(name: str, field: FieldInfo) -> str:
     cells = (f"`SPECIMAP_{name.upper()}`", _default(name, field), _takes(name, field), field.description or "")
     # A bar would end the cell, even within a code span.
@@ -47,8 +52,10 @@ def _default(name: str, field: FieldInfo) -> str:
     value = field.get_default(call_default_factory=True, validated_data={})
     if value is PydanticUndefined:
         raise TypeError(f"{name} has no default")
-    if value in ("", None):
+    if value in ("", None, {}) or isinstance(value, SecretStr):
         return ""
+    if isinstance(value, bool):
+        return str(value).lower()
     if name.endswith("_bytes"):
         for unit, size in (("GiB", GIB), ("MiB", MIB)):
             if value and value % size == 0:
@@ -61,10 +68,14 @@ def _takes(name: str, field: FieldInfo) -> str:
     if get_origin(kind) is Literal:
         return ", ".join(f"`{choice}`" for choice in get_args(kind))
     if kind in (Path, Path | None):
-        return "a folder"
-    if kind == list[str]:
+        return "a file" if name.endswith(FILES) else "a folder"
+    if kind in (list[str], list[SecretStr]):
         return "a JSON list of text"
-    if kind is str:
+    if kind == dict[str, float]:
+        return "a JSON object of numbers"
+    if kind is bool:
+        return "true or false"
+    if kind in (str, SecretStr):
         return "text"
     noun = {int: "whole number", float: "number"}[kind]
     limits = [f"{word} {value}" for word, value in _limits(field)]

@@ -11,7 +11,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from specimap_core.json_text import json_text
-from specimap_hospital.audit.event_codes import USER_AUTHENTICATION, Code, event_of
+from specimap_hospital.audit.event_codes import Code, event_of
 from specimap_infra.audit.records import FIELDS
 
 OUTCOMES = {"success": "0", "refused": "4", "failed": "8"}
@@ -66,7 +66,7 @@ def dicom_message(entry: Mapping[str, Any], source: Source) -> str:
     if entry["status"] is not None and entry["outcome"] != "success":
         ElementTree.SubElement(identification, "EventOutcomeDescription").text = f"HTTP status {entry['status']}"
     person = entry["key_id"] not in ("service", "cli")
-    if person or event.id is USER_AUTHENTICATION:
+    if person:
         _participant(message, str(entry["key_id"]) or "unknown", requestor=True, address=str(entry["address"]))
     _participant(message, source.id, requestor=not person, name="Specimap")
     origin = {"AuditEnterpriseSiteID": source.site} if source.site else {}

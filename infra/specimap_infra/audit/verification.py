@@ -126,11 +126,13 @@ class _Walk:
             .order_by(table.c.seq)
             .execution_options(yield_per=BATCH)
         )
-        for row in map(dict, self._session.execute(query).mappings()):
-            if (fault := self._step(row)) is not None:
-                return fault
-            if self.count % BATCH == 0:
-                progress(self.count / max(1, self._head.seq - self._head.pruned_seq))
+        total = max(1, self._head.seq - self._head.pruned_seq)
+        with self._session.execute(query) as rows:
+            for row in map(dict, rows.mappings()):
+                if (fault := self._step(row)) is not None:
+                    return fault
+                if self.count % BATCH == 0:
+                    progress(self.count / total)
         return None
 
     def _step(self, row: dict[str, Any]) -> Fault | None:

@@ -13,6 +13,7 @@ from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES, ba
 from specimap_infra.settings.audit import AuditSettings
 from specimap_infra.settings.logging import LogSettings
 from specimap_infra.settings.places import PlaceSettings
+from specimap_infra.settings.privacy import PrivacySettings
 from specimap_infra.settings.retention import RetentionSettings
 from specimap_infra.settings.server import ServerSettings
 from specimap_infra.settings.uploads import UploadSettings
@@ -32,6 +33,7 @@ class ServiceSettings(
     # The last one's fields come first.
     LogSettings,
     AuditSettings,
+    PrivacySettings,
     RetentionSettings,
     WebhookSettings,
     WorkerSettings,
