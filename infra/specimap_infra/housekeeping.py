@@ -25,7 +25,9 @@ from specimap_infra.audit.entries import name_digest, new_entry
 from specimap_infra.audit.pruning import prune
 from specimap_infra.audit.records import ChainKeys
 from specimap_infra.database import Database, rows_changed, utc_now
+from specimap_infra.deletion import remove_rest, remove_rows
 from specimap_infra.logs import logger
+from specimap_infra.retention import claim, expired, has_rules
 from specimap_infra.schema_version import engine_schema
 from specimap_infra.settings import ServiceSettings
 from specimap_infra.storage import TEMPORARY, Storage
@@ -41,6 +43,7 @@ from specimap_infra.tables import (
     JobEvent,
     LabelVersion,
     Lease,
+    LegalHold,
     RepeatableRequest,
     SignIn,
     Upload,
@@ -106,6 +109,7 @@ class Housekeeping:
             "audit": (s.keep_audit_days, self._audit),
             "requests": (REQUEST_DAYS, self._requests),
             "sessions": (SESSION_DAYS, self._sessions),
+            "acquisitions": (1 if has_rules(s) else 0, lambda _: self._acquisitions()),
         }
         removed = dict.fromkeys([*rules, "leftovers"], 0)
         for name, (days, batch) in rules.items():
@@ -228,7 +232,15 @@ class Housekeeping:
             )
             .scalar_subquery()
         )
-        query = sa.select(LabelVersion).where(newer >= self._settings.keep_label_versions).limit(BATCH)
+        query = (
+            sa.select(LabelVersion)
+            .join(CloudRow, CloudRow.id == LabelVersion.cloud_id)
+            .where(
+                newer >= self._settings.keep_label_versions,
+                ~sa.exists().where(LegalHold.acquisition_id == CloudRow.acquisition_id),
+            )
+            .limit(BATCH)
+        )
         with self._database.session() as session:
             labels = session.scalars(query).all()
             for label in labels:
@@ -237,6 +249,18 @@ class Housekeeping:
                 session.delete(label)
             prefixes = [label.storage_prefix for label in labels]
         return self._delete(prefixes)
+
+    def _acquisitions(self) -> int:
+        """Acquisitions that a rule of retention ends, each in a transaction of its own."""
+        for acquisition_id in expired(self._database, self._settings):
+            with self._database.session() as session:
+                if not claim(session, acquisition_id, self._settings):
+                    continue
+                new_entry(session, AUDITED_AS, "acquisition.expire", acquisition_id, {})
+                removal = remove_rows(session, [acquisition_id])
+            remove_rest(removal, self._queue, self._storage, [self._settings.scratch])
+            return 1
+        return 0
 
     def _delete(self, keys: list[str]) -> int:
         for key in keys:

@@ -7,7 +7,7 @@ from typing import Literal
 
 from ulid import ULID
 
-Kind = Literal["acq", "file", "up", "job", "cloud", "key", "exp", "evt", "att", "dlv", "prj", "shr"]
+Kind = Literal["acq", "file", "up", "job", "cloud", "key", "exp", "evt", "att", "dlv", "prj", "shr", "ers"]
 PATTERN = re.compile(r"^[a-z]{2,5}_[0-9a-hjkmnp-tv-z]{26}$")
 
 

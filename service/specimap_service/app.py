@@ -15,7 +15,7 @@ from specimap_core import __version__
 from specimap_infra.settings import ServiceSettings
 from specimap_service import health, problems
 from specimap_service.acquisitions import dependencies as acquisitions
-from specimap_service.acquisitions import file_routes, viewpoint_routes
+from specimap_service.acquisitions import erasure_routes, file_routes, hold_routes, viewpoint_routes
 from specimap_service.acquisitions import routes as acquisition_routes
 from specimap_service.auth import audit_routes, project_routes, session_routes
 from specimap_service.auth import dependencies as auth
@@ -67,6 +67,8 @@ ROUTES = (
     form_routes,
     file_routes,
     viewpoint_routes,
+    hold_routes,
+    erasure_routes,
     upload_routes,
     job_routes,
     delivery_routes,

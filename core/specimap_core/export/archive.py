@@ -26,7 +26,7 @@ def write_zarr_zip(cloud: Cloud, target: Path) -> Path:
     files = sorted(path for path in cloud.path.rglob("*") if path.is_file())
     extra = {"labels/zarr.json": GROUP_DOCUMENT} if cloud.label_names else {}
     named = ((path.relative_to(cloud.path).as_posix(), path) for path in files)
-    return _write_zip(target, ((name, path) for name, path in named if name not in extra), extra, zipfile.ZIP_STORED)
+    return write_zip(target, ((name, path) for name, path in named if name not in extra), extra, zipfile.ZIP_STORED)
 
 
 def write_envi_zip(cloud: Cloud, target: Path, *, grid_mm: float = 0.5) -> Path:
@@ -38,11 +38,12 @@ def write_envi_zip(cloud: Cloud, target: Path, *, grid_mm: float = 0.5) -> Path:
     with disk_errors(target), TemporaryDirectory(prefix=".", suffix=".tmp", dir=target.parent) as folder:
         header = write_envi(cloud, Path(folder) / "cloud", grid_mm=grid_mm)
         pair = [header, header.with_suffix(".bil")]
-        _write_zip(target, ((path.name, path) for path in pair), {}, zipfile.ZIP_DEFLATED)
+        write_zip(target, ((path.name, path) for path in pair), {}, zipfile.ZIP_DEFLATED)
     return target
 
 
-def _write_zip(target: Path, files: Iterable[tuple[str, Path]], extra: dict[str, bytes], method: int) -> Path:
+def write_zip(target: Path, files: Iterable[tuple[str, Path]], extra: dict[str, bytes], method: int) -> Path:
+    """Write files and ``extra`` contents under their names; the same ones make the same bytes."""
     with atomic_path(target) as aside, zipfile.ZipFile(aside, "w", method) as archive:
         for name, data in extra.items():
             archive.writestr(_entry(name, method), data)

@@ -55,7 +55,7 @@ class AuditSettings(BaseModel):
 
     @field_validator("audit_key")
     @classmethod
-    def _long_enough(cls, value: SecretStr) -> SecretStr:
+    def _audit_key_long_enough(cls, value: SecretStr) -> SecretStr:
         return checked_secret(value)
 
     @field_validator("audit_syslog")

@@ -35,7 +35,7 @@ class PrivacySettings(BaseModel):
 
     @field_validator("pseudonym_secret")
     @classmethod
-    def _long_enough(cls, value: SecretStr) -> SecretStr:
+    def _pseudonym_secret_long_enough(cls, value: SecretStr) -> SecretStr:
         return checked_secret(value)
 
     @field_validator("keep_acquisition_days_of")

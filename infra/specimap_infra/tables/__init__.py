@@ -9,6 +9,7 @@ from specimap_infra.tables.base import Base, UtcDateTime
 from specimap_infra.tables.clouds import CloudRow, Export, LabelVersion
 from specimap_infra.tables.jobs import Artefact, Delivery, Job, JobEvent, Lease, RepeatableRequest
 from specimap_infra.tables.names import FINAL_STATES, JOB_STATES, PRIORITIES, QUEUED, ROLES, SCOPES
+from specimap_infra.tables.privacy import Erasure, LegalHold
 
 __all__ = [
     "FINAL_STATES",
@@ -26,11 +27,13 @@ __all__ = [
     "Base",
     "CloudRow",
     "Delivery",
+    "Erasure",
     "Export",
     "Job",
     "JobEvent",
     "LabelVersion",
     "Lease",
+    "LegalHold",
     "Project",
     "RepeatableRequest",
     "Share",
