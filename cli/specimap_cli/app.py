@@ -11,9 +11,11 @@ from typing import Annotated
 import typer
 
 from specimap_cli import run_options
+from specimap_cli.audit import audit_app
 from specimap_cli.backup import backup, restore
 from specimap_cli.contexts import contexts_app
 from specimap_cli.doctor import doctor
+from specimap_cli.erasure import erase, verify_certificate
 from specimap_cli.errors import Debug, reported_errors, stoppable
 from specimap_cli.keys import keys_app
 from specimap_cli.phantom import phantom
@@ -230,8 +232,11 @@ app.command()(phantom)
 app.command()(doctor)
 app.command()(backup)
 app.command()(restore)
+app.command()(erase)
+app.command(name="verify-certificate")(verify_certificate)
 app.add_typer(study_app, name="study")
 app.add_typer(keys_app, name="keys")
 app.add_typer(contexts_app, name="contexts")
 app.add_typer(projects_app, name="projects")
 app.add_typer(storage_app, name="storage")
+app.add_typer(audit_app, name="audit")

@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from specimap_cli.erasure import eraser_of
 from specimap_cli.errors import Debug, reported_errors, stoppable
 from specimap_cli.progress import Listener, json_listener, progress_listener
-from specimap_cli.service_database import existing_database
+from specimap_cli.service_database import AUDITED_AS, existing_database
 
 if TYPE_CHECKING:
     from specimap_infra.backup import Manifest
+    from specimap_infra.settings import ServiceSettings
 
 Json = Annotated[bool, typer.Option("--json", help="One JSON line per event instead of a bar.")]
 MIB = 1024**2
@@ -55,6 +57,13 @@ def backup(
 def restore(
     source: Annotated[Path, typer.Option("--from", help="Folder that `specimap backup` made.")],
     check: Annotated[bool, typer.Option("--check", help="Check the backup's checksums only; restore nothing.")] = False,
+    erasures: Annotated[
+        Path | None,
+        typer.Option(
+            help="List of erasures since the backup, erasures.jsonl of the data folder that was lost; "
+            "by default the one in the data folder."
+        ),
+    ] = None,
     json_events: Json = False,
     debug: Debug = False,
 ) -> None:
@@ -68,10 +77,23 @@ def restore(
             if check:
                 manifest = check_backup(source.absolute(), progress=listener.progress, cancelled=stop_asked)
             else:
-                manifest = restore_backup(
-                    load_settings(), source.absolute(), progress=listener.progress, cancelled=stop_asked
-                )
+                settings = load_settings()
+                manifest = restore_backup(settings, source.absolute(), progress=listener.progress, cancelled=stop_asked)
+                erased = _erase_again(settings, erasures)
         _tell(listener, manifest, "checked" if check else "restored", source)
+        if not check and erased:
+            listener.kept("erased", f"Erased again {erased} specimens that had been erased since.", specimens=erased)
+
+
+def _erase_again(settings: ServiceSettings, given: Path | None) -> int:
+    """Erase what had been erased since the backup; return how many specimens."""
+    from specimap_hospital.erasure import LIST, erased_before
+
+    listed = erased_before(given or settings.data_dir / LIST)
+    if not listed:
+        return 0
+    with existing_database(settings) as database:
+        return len(eraser_of(database, settings).again(listed, AUDITED_AS))
 
 
 def _tell(listener: Listener, manifest: Manifest, done: str, folder: Path) -> None:

@@ -47,7 +47,15 @@ def make_engine(url: str, *, pool_size: int = POOL_SIZE, overflow: int = OVERFLO
         def _set_up(connection: object, _: object) -> None:
             # As the job engine does: writers queue instead of failing in the middle of a transaction.
             connection.isolation_level = "IMMEDIATE"  # type: ignore[attr-defined]
-            for pragma in ("busy_timeout=30000", "foreign_keys=ON", "journal_mode=WAL", "synchronous=FULL"):
+            # What is deleted is overwritten: an erasure leaves nothing in the file.
+            pragmas = (
+                "busy_timeout=30000",
+                "foreign_keys=ON",
+                "journal_mode=WAL",
+                "synchronous=FULL",
+                "secure_delete=ON",
+            )
+            for pragma in pragmas:
                 connection.execute(f"PRAGMA {pragma}")  # type: ignore[attr-defined]
 
         return engine

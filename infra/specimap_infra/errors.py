@@ -105,3 +105,15 @@ class ArchiveMissingError(SpecimapError, ValueError):
     """No archive to send DICOM objects to is set."""
 
     code = "archive_missing"
+
+
+class SyslogUnavailableError(SpecimapError, RuntimeError):
+    """The syslog server cannot be reached, or did not take what it was sent."""
+
+    code = "syslog_unavailable"
+
+
+class LegalHoldError(SpecimapError, PermissionError):
+    """A legal hold keeps the acquisition from being deleted, whoever asks; ``details['acquisition_id']``."""
+
+    code = "legal_hold"

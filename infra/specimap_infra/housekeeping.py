@@ -21,8 +21,13 @@ from sqlalchemy.orm import InstrumentedAttribute, Session, aliased
 
 from specimap_core.atomic import remove
 from specimap_core.errors import SpecimapError
+from specimap_infra.audit.entries import name_digest, new_entry
+from specimap_infra.audit.pruning import prune
+from specimap_infra.audit.records import ChainKeys
 from specimap_infra.database import Database, rows_changed, utc_now
+from specimap_infra.deletion import remove_rest, remove_rows
 from specimap_infra.logs import logger
+from specimap_infra.retention import claim, expired, has_rules
 from specimap_infra.schema_version import engine_schema
 from specimap_infra.settings import ServiceSettings
 from specimap_infra.storage import TEMPORARY, Storage
@@ -40,6 +45,7 @@ from specimap_infra.tables import (
     JobEvent,
     LabelVersion,
     Lease,
+    LegalHold,
     RepeatableRequest,
     SignIn,
     SignInAttempt,
@@ -110,6 +116,7 @@ class Housekeeping:
             "requests": (REQUEST_DAYS, self._requests),
             "sessions": (SESSION_DAYS, self._sessions),
             "attempts": (SESSION_DAYS, self._attempts),
+            "acquisitions": (1 if has_rules(s) else 0, lambda _: self._acquisitions()),
         }
         removed = dict.fromkeys([*rules, "leftovers"], 0)
         for name, (days, batch) in rules.items():
@@ -183,7 +190,8 @@ class Housekeeping:
         return self._rows(DicomInstance.id, DicomInstance.set_id.in_(ended))
 
     def _audit(self, before: datetime.datetime) -> int:
-        return self._rows(AuditEntry.id, AuditEntry.at < before)
+        forwarded_to = self._settings.audit_syslog
+        return prune(self._database, ChainKeys.of(self._settings), before, forwarded_to)
 
     def _requests(self, before: datetime.datetime) -> int:
         """Names of requests that may be sent again no longer."""
@@ -240,29 +248,34 @@ class Housekeeping:
             .scalar_subquery()
         )
         query = (
-            sa.select(LabelVersion, Acquisition.project_id)
+            sa.select(LabelVersion)
             .join(CloudRow, CloudRow.id == LabelVersion.cloud_id)
-            .join(Acquisition, Acquisition.id == CloudRow.acquisition_id)
-            .where(newer >= self._settings.keep_label_versions)
+            .where(
+                newer >= self._settings.keep_label_versions,
+                ~sa.exists().where(LegalHold.acquisition_id == CloudRow.acquisition_id),
+            )
             .limit(BATCH)
         )
         with self._database.session() as session:
-            rows = session.execute(query).all()
-            for label, project in rows:
-                details = {"layer": label.name, "version": label.version}
-                session.add(
-                    AuditEntry(
-                        key_id=AUDITED_AS,
-                        project_id=project,
-                        action="label.expire",
-                        target=label.cloud_id,
-                        details=details,
-                        correlation_id="",
-                    )
-                )
+            labels = session.scalars(query).all()
+            for label in labels:
+                details = {"layer": name_digest(label.cloud_id, label.name), "version": label.version}
+                new_entry(session, AUDITED_AS, "label.expire", label.cloud_id, details)
                 session.delete(label)
-            prefixes = [label.storage_prefix for label, _ in rows]
+            prefixes = [label.storage_prefix for label in labels]
         return self._delete(prefixes)
+
+    def _acquisitions(self) -> int:
+        """Acquisitions that a rule of retention ends, each in a transaction of its own."""
+        for acquisition_id in expired(self._database, self._settings):
+            with self._database.session() as session:
+                if not claim(session, acquisition_id, self._settings):
+                    continue
+                new_entry(session, AUDITED_AS, "acquisition.expire", acquisition_id, {})
+                removal = remove_rows(session, [acquisition_id])
+            remove_rest(removal, self._queue, self._storage, [self._settings.scratch])
+            return 1
+        return 0
 
     def _delete(self, keys: list[str]) -> int:
         for key in keys:

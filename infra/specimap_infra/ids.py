@@ -8,7 +8,7 @@ from typing import Literal
 from ulid import ULID
 
 Kind = Literal[
-    "acq", "file", "up", "job", "cloud", "key", "exp", "evt", "att", "dlv", "prj", "shr", "dcs", "dci", "person"
+    "acq", "file", "up", "job", "cloud", "key", "exp", "evt", "att", "dlv", "prj", "shr", "dcs", "dci", "person", "ers"
 ]
 PATTERN = re.compile(r"^[a-z]{2,6}_[0-9a-hjkmnp-tv-z]{26}$")
 

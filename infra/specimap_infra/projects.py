@@ -75,7 +75,17 @@ _IDS = {
 def project_of(session: Session, object_id: str) -> str | None:
     """Return the project of the object with an id of any kind; None where there is no such object."""
     kind = object_id.partition("_")[0]
+    if kind not in _OWNERS:
+        return None
     return session.scalar(_OWNERS[kind].where(_IDS[kind] == object_id))
+
+
+def acquisition_of(session: Session, object_id: str) -> str | None:
+    """Return the acquisition that an object belongs to; None where it belongs to none, or is not there."""
+    kind = object_id.partition("_")[0]
+    if kind in ("prj", "key", "person") or kind not in _OWNERS:
+        return None
+    return session.scalar(_OWNERS[kind].with_only_columns(Acquisition.id).where(_IDS[kind] == object_id))
 
 
 def within(table: type[Base], projects: sa.Select[str] | Sequence[str]) -> sa.ColumnElement[bool]:

@@ -36,6 +36,10 @@ def page_part() -> str:
     return f"{settings_table()}\n\n{OF_BACKENDS}\n\n{backends_table()}"
 
 
+FILES = ("_ca", "_certificate", "_key")
+"""Endings of the names of settings that name a file."""
+
+
 def _row(name: str, field: FieldInfo) -> str:
     cells = (f"`SPECIMAP_{name.upper()}`", _default(name, field), _takes(name, field), field.description or "")
     # A bar would end the cell, even within a code span.
@@ -48,7 +52,7 @@ def _default(name: str, field: FieldInfo) -> str:
     value = field.get_default(call_default_factory=True, validated_data={})
     if value is PydanticUndefined:
         raise TypeError(f"{name} has no default")
-    if value in ("", None) or (isinstance(value, SecretStr) and not value.get_secret_value()):
+    if value in ("", None, {}) or (isinstance(value, SecretStr) and not value.get_secret_value()):
         return ""
     if isinstance(value, bool):
         return str(value).lower()
@@ -70,13 +74,15 @@ def _takes(name: str, field: FieldInfo) -> str:
     if get_origin(kind) is Literal:
         return ", ".join(f"`{choice}`" for choice in get_args(kind))
     if kind in (Path, Path | None):
-        return "a file" if name.endswith("_file") else "a folder"
-    if kind == list[str]:
+        return "a file" if name.endswith(FILES) else "a folder"
+    if kind in (list[str], list[SecretStr]):
         return "a JSON list of text"
-    if kind is bool:
-        return "`true` or `false`"
+    if kind == dict[str, float]:
+        return "a JSON object of numbers"
     if kind == dict[str, str]:
         return "a JSON object of text"
+    if kind is bool:
+        return "`true` or `false`"
     if kind in (str, SecretStr):
         return "text" if kind is str else "text, a secret"
     noun = {int: "whole number", float: "number"}[kind]

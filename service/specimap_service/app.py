@@ -6,6 +6,7 @@ from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 
+from anyio import to_thread
 from fastapi import Depends, FastAPI
 from fastapi_offline import FastAPIOffline
 from starlette.middleware.cors import CORSMiddleware
@@ -14,10 +15,10 @@ from specimap_core import __version__
 from specimap_infra.settings import ServiceSettings
 from specimap_service import health, problems
 from specimap_service.acquisitions import dependencies as acquisitions
-from specimap_service.acquisitions import file_routes, viewpoint_routes
+from specimap_service.acquisitions import erasure_routes, file_routes, hold_routes, viewpoint_routes
 from specimap_service.acquisitions import routes as acquisition_routes
+from specimap_service.auth import audit_routes, project_routes, session_routes, sso_routes
 from specimap_service.auth import dependencies as auth
-from specimap_service.auth import project_routes, session_routes, sso_routes
 from specimap_service.auth import routes as key_routes
 from specimap_service.body_limits import BodyLimits
 from specimap_service.clouds import dependencies as clouds
@@ -62,12 +63,15 @@ ROUTES = (
     health,
     project_routes,
     key_routes,
+    audit_routes,
     session_routes,
     sso_routes,
     acquisition_routes,
     form_routes,
     file_routes,
     viewpoint_routes,
+    hold_routes,
+    erasure_routes,
     upload_routes,
     job_routes,
     delivery_routes,
@@ -100,6 +104,9 @@ def create_app(settings: ServiceSettings, pages: Path = FOLDER) -> FastAPI:
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         async with AsyncExitStack() as stack:
             stack.callback(context.close)
+            context.trail.start()
+            # Everything that is still answered is in it.
+            stack.push_async_callback(to_thread.run_sync, context.trail.stop)
             for feature in FEATURES:
                 await stack.enter_async_context(feature.running(app))
             yield
@@ -140,7 +147,7 @@ def create_app(settings: ServiceSettings, pages: Path = FOLDER) -> FastAPI:
             expose_headers=EXPOSED,
             max_age=600,
         )
-    app.add_middleware(RequestObserver, metrics=context.metrics)
+    app.add_middleware(RequestObserver, metrics=context.metrics, trail=context.trail)
     return app
 
 

@@ -10,13 +10,14 @@ from dbos import DBOSClient
 from fastapi import Depends
 from sqlalchemy.orm import Session
 
+from specimap_infra.audit.entries import new_entry
 from specimap_infra.database import Database
-from specimap_infra.projects import project_of
 from specimap_infra.queue import queue_client
 from specimap_infra.settings import ServiceSettings
 from specimap_infra.storage import Storage
-from specimap_infra.tables import AuditEntry
 from specimap_service.app_state import AppState
+from specimap_service.audit_note import NOTE
+from specimap_service.audit_trail import AuditTrail
 from specimap_service.metrics import Metrics
 
 ANSWER_HEADERS = "specimap.headers"
@@ -32,6 +33,7 @@ class AppContext:
     storage: Storage
     queue: DBOSClient
     metrics: Metrics
+    trail: AuditTrail
 
     @classmethod
     def open(cls, settings: ServiceSettings) -> AppContext:
@@ -42,7 +44,9 @@ class AppContext:
         """
         database = Database.open(settings.database)
         storage = Storage.open(settings)
-        return cls(settings, database, storage, queue_client(database.engine), Metrics(database, storage, settings))
+        metrics = Metrics(database, storage, settings)
+        queue = queue_client(database.engine)
+        return cls(settings, database, storage, queue, metrics, AuditTrail(database, settings))
 
     def close(self) -> None:
         """Close the connections."""
@@ -64,16 +68,15 @@ def audit(session: Session, key_id: str, action: str, target: str, **details: ob
 
     ``details`` hold ids and numbers, no names.
     """
-    project = project_of(session, target)
-    if project is None:
-        raise LookupError(f"{target} is not there to be written about")
-    session.add(
-        AuditEntry(
-            key_id=key_id,
-            project_id=project,
-            action=action,
-            target=target,
-            details=details,
-            correlation_id=correlation_id(),
-        )
+    note = NOTE.get()
+    new_entry(
+        session,
+        key_id,
+        action,
+        target,
+        details,
+        correlation_id=correlation_id(),
+        address="" if note is None else note.address,
     )
+    if note is not None:
+        note.written = True

@@ -1,5 +1,5 @@
-"""Plain ASGI middleware: correlation id, access log, metrics, headers for browsers, and the answer to unforeseen
-errors."""
+"""Plain ASGI middleware: correlation id, access log, audit trail, metrics, headers for browsers, and the answer to
+unforeseen errors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ from starlette.datastructures import MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from specimap_core.errors import SpecimapError
+from specimap_infra.errors import DatabaseUnavailableError
 from specimap_infra.logs import logger
+from specimap_service.audit_note import NOTE, AuditNote
+from specimap_service.audit_requests import access_of, is_audited
+from specimap_service.audit_trail import AuditTrail
 from specimap_service.context import ANSWER_HEADERS
 from specimap_service.metrics import Metrics
 from specimap_service.problems import problem_response
@@ -29,9 +33,10 @@ class RequestObserver:
     It logs no address, key or uploaded name.
     """
 
-    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+    def __init__(self, app: ASGIApp, metrics: Metrics, trail: AuditTrail) -> None:
         self._app = app
         self._metrics = metrics
+        self._trail = trail
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on."""
@@ -44,12 +49,18 @@ class RequestObserver:
         structlog.contextvars.bind_contextvars(correlation_id=correlation)
         more: dict[str, str] = {}
         scope[ANSWER_HEADERS] = more
+        audited = is_audited(scope)
+        note = AuditNote(address=self._trail.addresses.of(scope["client"][0]) if audited and scope["client"] else "")
+        NOTE.set(note)
         start, status = time.perf_counter(), 0
 
         async def observed_send(message: Message) -> None:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = message["status"]
+                if audited and (access := access_of(scope, note, status)) is not None:
+                    # Before the first byte of the answer.
+                    self._trail.record(access, correlation)
                 given_headers = MutableHeaders(raw=list(message.get("headers", [])))
                 add_policy(given_headers, scope["path"])
                 message["headers"] = [
@@ -61,7 +72,13 @@ class RequestObserver:
             await send(message)
 
         try:
+            if audited:
+                await self._trail.room()
             await self._app(scope, receive, observed_send)
+        except DatabaseUnavailableError as away:
+            if status:
+                raise
+            await problem_response(away)(scope, receive, observed_send)
         except Exception:
             logger().exception("unforeseen error")
             if status:  # the answer has begun; cutting it off is all that is left

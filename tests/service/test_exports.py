@@ -17,7 +17,7 @@ import xarray
 import zarr
 
 from specimap_core.cloud import Cloud
-from specimap_core.export.formats import KINDS, FileFormat
+from specimap_core.export.formats import DEIDENTIFIED, KINDS, FileFormat
 from specimap_core.native import open3d
 from specimap_core.surface.mesh_files import read_mesh_ply
 from specimap_infra.queue import EXPORTS, MAKE_EXPORT
@@ -211,7 +211,7 @@ def test_content_in_ranges(service: Running, client: httpx.Client, result: Resul
 
 @pytest.mark.slow
 def test_formats_of_the_function_and_unknown_ones(result: Result, tmp_path: Path) -> None:
-    for format in FileFormat:
+    for format in set(FileFormat) - DEIDENTIFIED:  # these need a plan of pseudonyms
         assert make_export_file(result.local, format.value, tmp_path / format.value).is_file()
     with pytest.raises(ValueError, match="dwg"):
         make_export_file(result.local, "dwg", tmp_path / "x")

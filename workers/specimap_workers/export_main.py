@@ -43,6 +43,11 @@ def make_export_file(cloud_folder: Path, format: str, target: Path) -> Path:
             return export_mesh(cloud_folder / "mesh.ply", target, mesh.removeprefix("mesh-"))
         case FileFormat.ZARR:
             return write_zarr_zip(Cloud.open(cloud_folder / "cloud.zarr"), target)
+        case FileFormat.DEIDENTIFIED | FileFormat.DEIDENTIFIED_INPUTS:
+            from specimap_core.export.deidentified.archive import write_deidentified
+            from specimap_core.export.deidentified.plan import Plan
+
+            return write_deidentified(cloud_folder, Plan.read(cloud_folder), target)
         case FileFormat.ENVI:
             return write_envi_zip(Cloud.open(cloud_folder / "cloud.zarr"), target)
         case (

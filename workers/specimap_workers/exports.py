@@ -6,14 +6,11 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from specimap_core.atomic import remove
-from specimap_core.cloud.schema import ARRAYS
-from specimap_core.errors import CancelledError, NotFoundError, SpecimapError
+from specimap_core.errors import CancelledError, SpecimapError
 from specimap_core.export.formats import FileFormat, file_name
 from specimap_core.sandbox.json_lines import InvalidMessageError, JsonLineProcess, ProcessEndedError, end_text
 from specimap_infra.database import Database
@@ -23,19 +20,17 @@ from specimap_infra.errors import (
     StorageUnavailableError,
     WorkerCrashedError,
 )
-from specimap_infra.labels import current_labels, fingerprint
 from specimap_infra.logs import logger
 from specimap_infra.setbacks import Setbacks, ended_from_outside, pause_seconds
 from specimap_infra.settings import ServiceSettings
 from specimap_infra.storage import Storage
-from specimap_infra.tables import CloudRow
+from specimap_workers.export_inputs import LostError, fetch_inputs
 from specimap_workers.export_main import REFUSED
 from specimap_workers.export_rows import claim, finish, held
 from specimap_workers.memory import MemoryWatch, offer_to_memory_killer
 from specimap_workers.patience import patience
 from specimap_workers.workspaces import Workspace, Workspaces, is_plain
 
-DOCUMENTS = (FileFormat.HTML, FileFormat.PDF)
 POLL_SECONDS = 0.1
 LONGEST_PAUSE_SECONDS = 3.0
 """Longest pause between two processes of an export: another may be in the queue."""
@@ -91,7 +86,7 @@ def _run(
     try:
         format = FileFormat(export.format)
         target = workspace.own / file_name(export.cloud_id, format)
-        labels_hash = _fetch(database, storage, export.cloud_id, format, workspace.given)
+        labels_hash = fetch_inputs(database, storage, settings, export.cloud_id, format, workspace.given)
         _make(workspaces, workspace, format, target, settings, lambda: held(database, export_id, executor), cancelled)
         # Each attempt has a place of its own: one that lost the row cannot replace the file that the row names.
         key, size = f"exports/{export_id}/{workspace.folder.stem}/{target.name}", target.stat().st_size
@@ -99,7 +94,7 @@ def _run(
         done = {"state": "succeeded", "storage_key": key, "size": size, "error": None, "labels_hash": labels_hash}
         if not finish(database, export_id, executor, done):
             storage.delete(key)
-    except _LostError:
+    except LostError:
         logger().warning("export lost", export=export_id)
     except (CancelledError, DatabaseUnavailableError, StorageUnavailableError):
         raise
@@ -119,48 +114,7 @@ def _run(
         workspace.remove()
 
 
-class _LostError(Exception):
-    """The row is another executor's now, or gone."""
-
-
 # ---- the file -----------------------------------------------------------------------------------------
-
-
-def _fetch(database: Database, storage: Storage, cloud_id: str, format: FileFormat, work: Path) -> str:
-    """Put what the format is made from into ``work``; the hash of the labels among it."""
-    with database.session() as session:
-        cloud = session.get(CloudRow, cloud_id)
-        labels = current_labels(session, cloud_id) if format is FileFormat.ZARR else []
-    if cloud is None:
-        raise _LostError
-    if format.startswith("mesh-"):
-        storage.fetch(f"{cloud.prefix}/mesh.ply", work / "mesh.ply")
-        return ""
-    if format in DOCUMENTS:
-        _fetch_drawn(storage, cloud.prefix, work)
-        return ""
-    storage.fetch(f"{cloud.prefix}/cloud.zarr", work / "cloud.zarr")
-    try:
-        for label in labels:
-            storage.fetch(label.storage_prefix, work / "cloud.zarr" / "labels" / label.name)
-    except NotFoundError:
-        # A layer was deleted since the rows were read. Where it was not, this ends with the error.
-        with database.session() as session:
-            if fingerprint(current_labels(session, cloud_id)) == fingerprint(labels):
-                raise
-        remove(work / "cloud.zarr")
-        return _fetch(database, storage, cloud_id, format, work)
-    return fingerprint(labels) if format is FileFormat.ZARR else ""
-
-
-def _fetch_drawn(storage: Storage, prefix: str, work: Path) -> None:
-    """What a report is drawn from: all but the spectra, which are nearly all of a cloud."""
-    for name in ("zarr.json", "spectra/zarr.json", *(array for array in ARRAYS if array != "spectra")):
-        storage.fetch(f"{prefix}/cloud.zarr/{name}", work / "cloud.zarr" / name)
-    storage.fetch(f"{prefix}/report.json", work / "report.json")
-    for name in ("photos.jpg", "preview.png"):  # older results have no photos
-        with suppress(NotFoundError):
-            storage.fetch(f"{prefix}/{name}", work / name)
 
 
 def _make(
@@ -176,7 +130,7 @@ def _make(
 
     Raises:
         SpecimapError: what it raised there, or WorkerCrashedError, StageTimeoutError, CancelledError.
-        _LostError: the row is another's.
+        LostError: the row is another's.
     """
     setbacks = Setbacks()
     while True:
@@ -268,4 +222,4 @@ def _run_once(
             if now - asked > HELD_SECONDS:
                 asked = now
                 if not held():
-                    raise _LostError
+                    raise LostError

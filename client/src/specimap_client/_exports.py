@@ -14,7 +14,20 @@ from specimap_client._http import Session, path
 from specimap_client._models import Export, Progress
 
 Format = Literal[
-    "mesh-ply", "mesh-stl", "mesh-obj", "mesh-glb", "ply", "las", "npz", "envi", "zarr", "csv", "html", "pdf"
+    "mesh-ply",
+    "mesh-stl",
+    "mesh-obj",
+    "mesh-glb",
+    "ply",
+    "las",
+    "npz",
+    "envi",
+    "zarr",
+    "csv",
+    "html",
+    "pdf",
+    "deidentified",
+    "deidentified-inputs",
 ]
 _PAUSES = (0.1, 0.25, 0.5, 1.0, 2.0)
 

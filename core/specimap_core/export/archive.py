@@ -45,8 +45,7 @@ def write_envi_zip(cloud: Cloud, target: Path, *, grid_mm: float = 0.5) -> Path:
 
 
 def write_files_zip(target: Path, files: Iterable[tuple[str, Path]], extra: dict[str, bytes], method: int) -> Path:
-    """Write named files, after ``extra`` content by name, as a ZIP with a compression of :mod:`zipfile`; the same files
-    make the same bytes. Raises StorageFullError, OutputNotWritableError."""
+    """Write files and ``extra`` contents under their names; the same ones make the same bytes."""
     with atomic_path(target) as aside, zipfile.ZipFile(aside, "w", method) as archive:
         for name, data in extra.items():
             archive.writestr(_entry(name, method), data)

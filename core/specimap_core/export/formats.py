@@ -7,7 +7,10 @@ from enum import StrEnum
 
 
 class FileFormat(StrEnum):
-    """A format of a single file; ``mesh-ply`` is there with every result, ``html`` and ``pdf`` are the report on it."""
+    """A format of a single file; ``mesh-ply`` is there with every result, ``html`` and ``pdf`` are the report on it.
+
+    ``deidentified`` is the result under pseudonyms, ``deidentified-inputs`` with photos and cube.
+    """
 
     MESH_PLY = "mesh-ply"
     MESH_STL = "mesh-stl"
@@ -21,6 +24,13 @@ class FileFormat(StrEnum):
     CSV = "csv"
     HTML = "html"
     PDF = "pdf"
+    DEIDENTIFIED = "deidentified"
+    DEIDENTIFIED_INPUTS = "deidentified-inputs"
+
+
+DEIDENTIFIED = frozenset({FileFormat.DEIDENTIFIED, FileFormat.DEIDENTIFIED_INPUTS})
+WITH_LABELS = frozenset({FileFormat.ZARR, *DEIDENTIFIED})
+"""Formats that hold the label layers: they are made again once these have changed."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +54,8 @@ KINDS: dict[FileFormat, FileKind] = {
     FileFormat.CSV: FileKind("csv", "text/csv"),
     FileFormat.HTML: FileKind("report.html", "text/html"),
     FileFormat.PDF: FileKind("report.pdf", "application/pdf"),
+    FileFormat.DEIDENTIFIED: FileKind("deidentified.zip", "application/zip"),
+    FileFormat.DEIDENTIFIED_INPUTS: FileKind("deidentified-inputs.zip", "application/zip"),
 }
 
 

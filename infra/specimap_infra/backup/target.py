@@ -16,7 +16,7 @@ from specimap_infra.projects import DEFAULT_PROJECT
 from specimap_infra.references import PLACES
 from specimap_infra.schema_version import engine_schema, refuse_newer
 from specimap_infra.storage import Storage
-from specimap_infra.tables import Base, Project
+from specimap_infra.tables import AuditHead, Base, Project
 
 
 def sqlite_file(url: str) -> Path | None:
@@ -50,6 +50,8 @@ def refuse_rows(engine: sa.Engine) -> None:
             if table is Project.__table__:
                 # Made with the tables.
                 query = query.where(Project.id != DEFAULT_PROJECT)
+            elif table is AuditHead.__table__:
+                query = query.where(AuditHead.seq != 0)
             if connection.execute(query).first() is not None:
                 raise _used(f"the database ({table.name})")
         schema = engine_schema(engine.dialect)

@@ -10,11 +10,13 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 
 from specimap_core.errors import SettingsError
 from specimap_core.reconstruct.backends.environment import BACKEND_VARIABLES, backends_from
+from specimap_infra.settings.audit import AuditSettings
 from specimap_infra.settings.fhir import FhirSettings
 from specimap_infra.settings.hospital import HospitalSettings
 from specimap_infra.settings.identity import IdentitySettings
 from specimap_infra.settings.logging import LogSettings
 from specimap_infra.settings.places import PlaceSettings
+from specimap_infra.settings.privacy import PrivacySettings
 from specimap_infra.settings.retention import RetentionSettings
 from specimap_infra.settings.server import ServerSettings
 from specimap_infra.settings.uploads import UploadSettings
@@ -34,6 +36,8 @@ class ServiceSettings(
     # The last one's fields come first.
     LogSettings,
     HospitalSettings,
+    AuditSettings,
+    PrivacySettings,
     RetentionSettings,
     FhirSettings,
     WebhookSettings,

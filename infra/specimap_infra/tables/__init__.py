@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from specimap_infra.tables.access import ApiKey, AuditEntry, Project, Share, SignIn
+from specimap_infra.tables.access import ApiKey, Project, Share, SignIn
 from specimap_infra.tables.acquisitions import Acquisition, StoredFile, Upload, UploadPart
+from specimap_infra.tables.audit import AuditCursor, AuditEntry, AuditHead
 from specimap_infra.tables.base import Base, UtcDateTime
 from specimap_infra.tables.clouds import CloudRow, Export, LabelVersion
 from specimap_infra.tables.fhir import FhirNotice
@@ -11,6 +12,7 @@ from specimap_infra.tables.hospital import DicomInstance, DicomSet, SealedStudy
 from specimap_infra.tables.jobs import Artefact, Delivery, Job, JobEvent, Lease, RepeatableRequest
 from specimap_infra.tables.names import DICOM_STATES, FINAL_STATES, JOB_STATES, PRIORITIES, QUEUED, ROLES, SCOPES
 from specimap_infra.tables.people import Person, SignInAttempt
+from specimap_infra.tables.privacy import Erasure, LegalHold
 
 __all__ = [
     "DICOM_STATES",
@@ -23,18 +25,22 @@ __all__ = [
     "Acquisition",
     "ApiKey",
     "Artefact",
+    "AuditCursor",
     "AuditEntry",
+    "AuditHead",
     "Base",
     "CloudRow",
     "Delivery",
     "DicomInstance",
     "DicomSet",
+    "Erasure",
     "Export",
     "FhirNotice",
     "Job",
     "JobEvent",
     "LabelVersion",
     "Lease",
+    "LegalHold",
     "Person",
     "Project",
     "RepeatableRequest",

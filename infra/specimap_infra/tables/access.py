@@ -1,4 +1,4 @@
-"""Tables of those that use the service: projects, keys, sessions, shares; the audit trail."""
+"""Tables of those that use the service: projects, keys, sessions, shares."""
 
 from __future__ import annotations
 
@@ -77,21 +77,3 @@ class Share(Base):
     expires_at: Mapped[datetime.datetime]
     revoked_at: Mapped[datetime.datetime | None]
     last_used_at: Mapped[datetime.datetime | None]
-
-
-class AuditEntry(Base):
-    """An entry of the audit trail: which key or person did what to which object. It outlives the object."""
-
-    __tablename__ = "audit"
-    __table_args__ = (sa.Index("ix_audit_project_id", "project_id", "id"),)
-
-    id: Mapped[int] = mapped_column(sa.BigInteger().with_variant(sa.Integer, "sqlite"), primary_key=True)
-    at: Mapped[datetime.datetime] = mapped_column(default=utc_now, index=True)
-    key_id: Mapped[str]
-    """Of a key, a person or a share."""
-    project_id: Mapped[str]
-    """The project of the target; empty where that is of no project."""
-    action: Mapped[str]
-    target: Mapped[str] = mapped_column(index=True)
-    details: Mapped[dict[str, Any]]
-    correlation_id: Mapped[str]

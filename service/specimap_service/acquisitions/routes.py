@@ -13,10 +13,10 @@ from sqlalchemy.orm import Session
 from specimap_core.pipeline.options import DEFAULTS, Dictionary
 from specimap_infra.completeness import FileRow, files_of, missing_of
 from specimap_infra.database import utc_now
-from specimap_infra.errors import JobConflictError
+from specimap_infra.deletion import check_removable
 from specimap_infra.ids import new_id
 from specimap_infra.job_schemas import EdgeMm
-from specimap_infra.tables import FINAL_STATES, Acquisition, Job, Upload
+from specimap_infra.tables import Acquisition, Job, Upload
 from specimap_service.acquisitions.capacity import locked_acquisition
 from specimap_service.acquisitions.dependencies import JudgeDep, UnfinishedUploadsDep
 from specimap_service.acquisitions.schemas import FileCounts, counts
@@ -182,14 +182,8 @@ def delete_acquisition(
 
 
 def check_idle(session: Session, acquisition_id: str) -> None:
-    """Raise JobConflictError while a job of the acquisition is queued or running."""
-    busy = session.scalar(
-        sa.select(Job.id).where(Job.acquisition_id == acquisition_id, Job.state.not_in(FINAL_STATES)).limit(1)
-    )
-    if busy is not None:
-        raise JobConflictError(
-            f"Job {busy} works on the acquisition.", advice="Wait for it, or cancel it first.", job_id=busy
-        )
+    """Raise JobConflictError while a job of the acquisition is queued or running, LegalHoldError while it is held."""
+    check_removable(session, acquisition_id)
 
 
 def _view(session: Session, row: Acquisition) -> AcquisitionView:

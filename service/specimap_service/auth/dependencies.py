@@ -12,6 +12,7 @@ from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBea
 
 from specimap_infra.errors import DatabaseUnavailableError
 from specimap_service.app_state import AppState
+from specimap_service.audit_note import NOTE
 from specimap_service.auth.access import Access
 from specimap_service.auth.credentials import COOKIE, PAGE_HEADER, Credential, credential_of
 from specimap_service.auth.keys import KEPT_SECONDS, Keyring, Principal
@@ -100,6 +101,10 @@ async def known_by(request: Request, credential: Credential) -> Principal:
         address = request.client.host if request.client else "unknown"
         limiter.take(f"address:{address}", FAILURES_PER_MINUTE)
         raise
+    if (note := NOTE.get()) is not None:
+        note.actor, note.session_id = found.key_id, found.session_id or ""
+        # Of several projects, an entry names that of its target.
+        note.project_id = found.project_ids[0] if len(found.project_ids) == 1 else ""
     try:
         left = limiter.take(found.key_id, found.rate_per_minute)
     except RateLimitedError as error:

@@ -18,6 +18,10 @@ URGENT: Final = "job.urgent"
 SHARE: Final = "share.manage"
 LABEL: Final = "label.write"
 DELETE: Final = "object.delete"
+STUDY: Final = "study.manage"
+SEND: Final = "result.send"
+HOLD: Final = "hold.manage"
+ERASE: Final = "specimen.erase"
 AUDIT: Final = "audit.read"
 AUDIT_ALL: Final = "audit.all"
 KEYS: Final = "key.manage"
@@ -33,6 +37,10 @@ MEANINGS: dict[str, str] = {
     SHARE: "make, list and revoke links that show one result",
     LABEL: "write and delete label layers",
     DELETE: "delete acquisitions and jobs with all that belongs to them",
+    STUDY: "see and change whose a specimen is: look orders up, keep study contexts, fetch DICOM objects",
+    SEND: "have results sent to the archive and to the FHIR server",
+    HOLD: "keep acquisitions from being deleted",
+    ERASE: "erase all acquisitions of a specimen, of all projects",
     AUDIT: "read the audit trail",
     AUDIT_ALL: "read the audit trail of all projects, and what is of none",
     KEYS: "create, list and revoke keys",
@@ -44,8 +52,8 @@ MEANINGS: dict[str, str] = {
 EVERYTHING = frozenset(MEANINGS)
 
 ROLES: dict[str, frozenset[str]] = {
-    "technician": frozenset({READ, CAPTURE, RUN, URGENT}),
-    "clinician": frozenset({READ, SHARE, LABEL}),
+    "technician": frozenset({READ, CAPTURE, RUN, URGENT, STUDY, SEND}),
+    "clinician": frozenset({READ, SHARE, LABEL, STUDY, SEND}),
     "classifier": frozenset({READ, LABEL}),
     "admin": EVERYTHING,
     "auditor": frozenset({AUDIT, AUDIT_ALL}),
@@ -53,7 +61,7 @@ ROLES: dict[str, frozenset[str]] = {
 """What a person of a role may."""
 
 SCOPE_PERMISSIONS: dict[str, frozenset[str]] = {
-    "upload": frozenset({CAPTURE, RUN, SHARE}),
+    "upload": frozenset({CAPTURE, RUN, SHARE, STUDY, SEND}),
     "read": frozenset({READ}),
     "label": frozenset({LABEL}),
     "intraoperative": frozenset({URGENT}),
@@ -69,8 +77,8 @@ EQUIVALENT: dict[str, tuple[str, ...]] = {
     "admin": ("admin",),
     "auditor": ("audit",),
 }
-"""Scopes of a key for a program that does the work of a role. They differ in what goes beyond: ``share.manage`` comes
-with ``upload``, and ``audit.all`` with ``admin`` alone."""
+"""Scopes of a key for a program that does the work of a role. They differ in what goes beyond: ``share.manage`` and
+``study.manage`` come with ``upload``, and ``audit.all`` with ``admin`` alone."""
 
 OPERATIONS: dict[str, str | None] = {
     "acquisitions.create": CAPTURE,
@@ -85,17 +93,27 @@ OPERATIONS: dict[str, str | None] = {
     "clouds.list": READ,
     "deliveries.create": RUN,
     "deliveries.list": READ,
+    "dicom.get_archive": STUDY,
+    "dicom.list": READ,
+    "dicom.send": SEND,
+    "erasures.create": ERASE,
+    "erasures.list": ERASE,
     "exports.create": READ,
     "exports.get": READ,
     "exports.get_content": READ,
     "exports.head_content": READ,
     "exports.list": READ,
+    "fhir.get": READ,
+    "fhir.send": SEND,
     "files.create": CAPTURE,
     "files.delete": CAPTURE,
     "files.get": READ,
     "files.get_content": READ,
     "files.list": READ,
     "health.get_metrics": WATCH,
+    "holds.delete": HOLD,
+    "holds.get": READ,
+    "holds.put": HOLD,
     "jobs.cancel": RUN,
     "jobs.create": RUN,
     "jobs.delete": DELETE,
@@ -114,6 +132,7 @@ OPERATIONS: dict[str, str | None] = {
     "labels.list": READ,
     "labels.list_versions": READ,
     "labels.put": LABEL,
+    "orders.search": STUDY,
     "previews.get_band": READ,
     "previews.get_composite": READ,
     "previews.get_index": READ,
@@ -134,6 +153,9 @@ OPERATIONS: dict[str, str | None] = {
     "spectra.get_point": READ,
     "spectra.select": READ,
     "sso.end": None,
+    "studies.delete": STUDY,
+    "studies.get": STUDY,
+    "studies.put": STUDY,
     "uploads.append": CAPTURE,
     "uploads.create": CAPTURE,
     "uploads.delete": CAPTURE,

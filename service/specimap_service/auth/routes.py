@@ -1,17 +1,17 @@
-"""Keys, created, listed and revoked by an administrator; and the audit trail."""
+"""Keys, created, listed and revoked by an administrator."""
 
 from __future__ import annotations
 
 import datetime
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import sqlalchemy as sa
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Request, Response
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 
 from specimap_infra.database import utc_now
-from specimap_infra.tables import ApiKey, AuditEntry
+from specimap_infra.tables import ApiKey
 from specimap_service.auth.access import in_sight, load, project_for_new
 from specimap_service.auth.credentials import credential_of, is_secret_of
 from specimap_service.auth.dependencies import Admin, KeyringDep
@@ -20,7 +20,7 @@ from specimap_service.auth.object_ids import KeyId
 from specimap_service.context import Context, audit
 from specimap_service.errors import IdempotencyConflictError, RequestInvalidError
 from specimap_service.idempotency import IdempotencyKey, Repeatable, repeated
-from specimap_service.paging import After, InProject, Limit, MaybeLimit, Moment, Page, Sort, listed, page_of, paged
+from specimap_service.paging import After, InProject, MaybeLimit, Moment, Sort, listed, paged
 
 router = APIRouter(prefix="/v1", tags=["keys"])
 
@@ -72,21 +72,6 @@ class NewKey(Key):
     key: str = Field(
         description="The key itself; it is shown this once, or again for the same Idempotency-Key, and kept nowhere."
     )
-
-
-class Audited(BaseModel):
-    """An entry of the audit trail: which key or person did what to which object."""
-
-    model_config = ConfigDict(title="AuditEntry", from_attributes=True)
-
-    id: int
-    at: datetime.datetime
-    key_id: str
-    project_id: str = Field(description="The target's project.")
-    action: str
-    target: str
-    details: dict[str, Any]
-    correlation_id: str
 
 
 @router.post("/keys", status_code=201, responses=repeated(NewKey), operation_id="keys.create")
@@ -164,25 +149,3 @@ def revoke_key(context: Context, principal: Admin, keyring: KeyringDep, key_id: 
         row.revoked_at = row.revoked_at or utc_now()
         audit(session, principal.key_id, "key.revoke", key_id)
     keyring.forget()
-
-
-@router.get("/audit", operation_id="audit.list")
-def list_audit(
-    context: Context,
-    principal: Admin,
-    target: Annotated[
-        str | None, Query(pattern=r"^[a-z]{2,6}_[0-9a-z]{26}$", description="Only entries about this object.")
-    ] = None,
-    project: InProject = None,
-    after: Annotated[int | None, Query(ge=1, le=10**18, description="`next` of the page before.")] = None,
-    limit: Limit = 100,
-    sort: Sort = "-created_at",
-) -> Page[Audited]:
-    """List the audit trail."""
-    query = sa.select(AuditEntry).where(in_sight(principal, AuditEntry, project))
-    if target is not None:
-        query = query.where(AuditEntry.target == target)
-    query = paged(query, AuditEntry.id, after, limit, sort)
-    with context.database.session() as session:
-        rows = list(session.scalars(query))
-    return page_of([Audited.model_validate(row) for row in rows], [str(row.id) for row in rows], limit)

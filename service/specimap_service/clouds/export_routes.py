@@ -11,11 +11,13 @@ from pydantic import BaseModel, Field
 from sqlalchemy.orm import Session
 
 from specimap_core.errors import NotFoundError
-from specimap_core.export.formats import KINDS, FileFormat, file_name
+from specimap_core.export.formats import DEIDENTIFIED, KINDS, FileFormat, file_name
 from specimap_infra import tables
 from specimap_infra.errors import JobConflictError
+from specimap_infra.export_state import state_hash
 from specimap_infra.ids import new_id
-from specimap_infra.labels import current_labels, fingerprint, lock_cloud
+from specimap_infra.labels import current_labels, lock_cloud
+from specimap_infra.pseudonyms import Pseudonyms
 from specimap_infra.queue import EXPORTS, MAKE_EXPORT, enqueue
 from specimap_infra.tables import PRIORITIES
 from specimap_service.auth.dependencies import Reader
@@ -62,7 +64,8 @@ def create_export(
     """Have a file made, once for each format; asked again, return its state.
 
     A failed export is tried again under a new id. `zarr` holds the label layers; if they have changed since, it is
-    made again.
+    made again. So do `deidentified`, the result under pseudonyms, and `deidentified-inputs`, which has photos and cube
+    too; they need the service's key of pseudonyms.
     """
     cloud = clouds.record(cloud_id)
     response.headers["Location"] = f"/v1/clouds/{cloud_id}/exports/{format.value}"
@@ -96,13 +99,14 @@ def _made(
     """Return the row of an export, new where there is none of use, and the id of the one that it replaces."""
     replaced: str | None = None
     lock_cloud(session, cloud_id)
+    if format in DEIDENTIFIED:
+        Pseudonyms.of(context.settings)
     row = session.scalar(_query(cloud_id, format))
     if row is not None and (
         row.state in ("failed", "cancelled")
         or (
             row.state == "succeeded"
-            and format is FileFormat.ZARR
-            and row.labels_hash != fingerprint(current_labels(session, cloud_id))
+            and row.labels_hash != state_hash(format, current_labels(session, cloud_id), context.settings)
         )
     ):
         replaced = row.id
@@ -189,8 +193,14 @@ def get_content(
             )
     kind = KINDS[format]
     return ranged_response(
-        request, context.storage, key or "", kind.media_type, file_name(cloud_id, format), cache=REVALIDATED
+        request, context.storage, key or "", kind.media_type, _name(context, cloud_id, format), cache=REVALIDATED
     )
+
+
+def _name(context: AppContext, cloud_id: str, format: FileFormat) -> str:
+    """Return the file's name; that of a de-identified one holds the result's pseudonym alone."""
+    named = Pseudonyms.of(context.settings).of_text("result", cloud_id) if format in DEIDENTIFIED else cloud_id
+    return file_name(named, format)
 
 
 def _query(cloud_id: str, format: FileFormat) -> sa.Select[tables.Export]:

@@ -18,10 +18,12 @@ from specimap_core.atomic import disk_errors, remove
 from specimap_core.cloud.labels import describe_label, write_label
 from specimap_core.errors import NotFoundError
 from specimap_core.json_text import json_text
+from specimap_infra.audit.entries import name_digest
+from specimap_infra.deletion import check_not_held
 from specimap_infra.errors import DatabaseUnavailableError
 from specimap_infra.labels import lock_cloud
 from specimap_infra.storage import Storage
-from specimap_infra.tables import LabelVersion
+from specimap_infra.tables import CloudRow, LabelVersion
 from specimap_service.auth.keys import Principal
 from specimap_service.clouds.label_body import LabelMetadata
 from specimap_service.clouds.open_clouds import OpenClouds
@@ -125,7 +127,8 @@ def put_label(
                     created_by=principal.key_id,
                 )
                 session.add(row)
-                audit(session, principal.key_id, "label.put", cloud_id, layer=name, version=version)
+                layer = name_digest(cloud_id, name)
+                audit(session, principal.key_id, "label.put", cloud_id, layer=layer, version=version)
                 session.flush()
                 _publish(context.storage, work, prefix, {**stored, "version": version})
         except DatabaseUnavailableError:
@@ -174,8 +177,10 @@ def delete_label(
         if not prefixes:
             raise no_label(cloud_id, name)
         conditions.check(session.scalar(sa.select(sa.func.max(LabelVersion.version)).where(layer)))
+        check_not_held(session, session.get_one(CloudRow, cloud_id).acquisition_id)
         session.execute(sa.delete(LabelVersion).where(layer))
-        audit(session, principal.key_id, "label.delete", cloud_id, layer=name, versions=len(prefixes))
+        digest = name_digest(cloud_id, name)
+        audit(session, principal.key_id, "label.delete", cloud_id, layer=digest, versions=len(prefixes))
     clouds.forget(cloud_id)
     for prefix in prefixes:
         context.storage.delete(prefix)

@@ -31,4 +31,4 @@ async def search_orders(
 
 def _note(context: AppContext, principal: Principal, found: Orders) -> None:
     with context.database.session() as session:
-        audit(session, principal.key_id, "order.search", principal.project_id, found=len(found.orders))
+        audit(session, principal.key_id, "order.search", principal.key_id, found=len(found.orders))

@@ -10,6 +10,7 @@ from sqlalchemy.exc import IntegrityError, SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from specimap_infra.completeness import missing
+from specimap_infra.deletion import check_not_held
 from specimap_infra.errors import JobConflictError
 from specimap_infra.ids import new_id
 from specimap_infra.job_schemas import JobView, job_settings, job_views
@@ -166,6 +167,7 @@ def delete_job(context: AppContext, clouds: OpenClouds, key_id: str, job_id: str
         job = locked(session, job_id) or found_job(session, job_id)
         if job.state not in FINAL_STATES:
             raise JobConflictError(f"Job {job_id} is {job.state}.", advice="Cancel it first.", state=job.state)
+        check_not_held(session, job.acquisition_id)
         acquisition, files = job.acquisition_id, JobFiles.of(session, [job_id])
         audit(session, key_id, "job.delete", job_id, acquisition=acquisition)
         session.execute(sa.delete(Job).where(Job.id == job_id))

@@ -1,0 +1,1 @@
+"""The audit trail outside of the service: DICOM audit messages, lines of JSON, a syslog server."""
