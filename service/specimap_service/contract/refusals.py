@@ -63,7 +63,7 @@ OWN: dict[str, tuple[Refusal, ...]] = {
     ),
     "dicom.list": _CLOUD,
     "fhir.get": _CLOUD,
-    "fhir.send": (*_CLOUD, infra.FhirServerMissingError, infra.StudyKeysMissingError, infra.StudyMissingError),
+    "fhir.create": (*_CLOUD, infra.FhirServerMissingError, infra.StudyKeysMissingError, infra.StudyMissingError),
     "dicom.send": (*_CLOUD, infra.ArchiveMissingError, infra.StudyKeysMissingError, infra.StudyMissingError),
     "erasures.create": (
         core.NotFoundError,

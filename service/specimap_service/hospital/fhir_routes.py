@@ -22,7 +22,7 @@ from specimap_service.auth.object_ids import CloudId
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import Context, audit
 
-router = APIRouter(prefix="/v1/clouds/{cloud_id}/fhir", tags=["hospital"])
+router = APIRouter(prefix="/v1/clouds/{cloud_id}/fhir", tags=["fhir"])
 
 
 class FhirNotice(BaseModel):
@@ -54,7 +54,7 @@ def get_notice(context: Context, principal: Reader, clouds: CloudsDep, cloud_id:
         return FhirNotice.model_validate(row)
 
 
-@router.post("", status_code=202, operation_id="fhir.send")
+@router.post("", status_code=202, operation_id="fhir.create")
 def send_notice(context: Context, principal: Uploader, clouds: CloudsDep, cloud_id: CloudId) -> FhirNotice:
     """Tell the FHIR server of a result, or tell it again: it replaces what it was told before."""
     clouds.record(cloud_id)
