@@ -52,7 +52,9 @@ EVERY_SECONDS = 3600.0
 STOP_SECONDS = 3.0
 LEFTOVER_SECONDS = 24 * 3600.0
 """Age from which a file aside belongs to a process that was killed; none works on one for as long."""
-LEFTOVER = re.compile(r"^(?:(?:dicom-)?[0-9a-f]{32}|label-[0-9a-f]{32}(?:\.body)?|exp_[\w-]+|restore-[0-9a-f]{32})\.tmp$")
+LEFTOVER = re.compile(
+    r"^(?:[0-9a-f]{32}|dicom-[0-9a-f]{32}|label-[0-9a-f]{32}(?:\.body)?|exp_[\w-]+|restore-[0-9a-f]{32})\.tmp$"
+)
 """Names that our programs give in the scratch folder, which may be shared with others."""
 AUDITED_AS = "service"
 REQUEST_DAYS = 7.0

@@ -263,6 +263,8 @@ CASES: dict[tuple[str, str], Case] = {
     ("GET", f"{CLOUD}/dicom"): _read(),
     ("GET", f"{CLOUD}/dicom.zip"): Case("upload", aims=True),
     ("POST", f"{CLOUD}/dicom"): Case("upload", 202, _json(), aims=True),
+    # Where it is off.
+    ("POST", "/v1/dicomweb/studies"): Case("upload", 404),
     # what ends something: each after all that needs it
     ("DELETE", "/v1/uploads/{uuid}"): Case("upload", 204, _tus(), aims=True),
     ("DELETE", f"{CLOUD}/shares/{{share_id}}"): Case("upload", 204, aims=True),

@@ -6,7 +6,7 @@ from specimap_infra.tables.access import ApiKey, AuditEntry, Project, Share, Sig
 from specimap_infra.tables.acquisitions import Acquisition, StoredFile, Upload, UploadPart
 from specimap_infra.tables.base import Base, UtcDateTime
 from specimap_infra.tables.clouds import CloudRow, Export, LabelVersion
-from specimap_infra.tables.hospital import DicomInstance, DicomSet, SealedStudy
+from specimap_infra.tables.hospital import DicomInstance, DicomSet, ReceivedStudy, SealedStudy
 from specimap_infra.tables.jobs import Artefact, Delivery, Job, JobEvent, Lease, RepeatableRequest
 from specimap_infra.tables.names import DICOM_STATES, FINAL_STATES, JOB_STATES, PRIORITIES, QUEUED, ROLES, SCOPES
 
@@ -33,6 +33,7 @@ __all__ = [
     "LabelVersion",
     "Lease",
     "Project",
+    "ReceivedStudy",
     "RepeatableRequest",
     "SealedStudy",
     "Share",
