@@ -24,7 +24,7 @@ class OrderQuery(BaseModel):
     accession_number: Short = Field(default="", description="Of the order.")
     patient_id: Long = Field(default="", description="Of the patient.")
     station: Short = Field(
-        default="", description="Application entity title of the station that the step is scheduled for."
+        default="", description="Title of the station that the step is scheduled for."
     )
 
     @model_validator(mode="after")
@@ -40,7 +40,7 @@ class Order(BaseModel):
     source: Literal["worklist", "qido"] = Field(description="Where it was found.")
     study: StudyContext = Field(description="PUT it as the acquisition's study context to choose the order.")
     scheduled_at: datetime.datetime | None = Field(
-        default=None, description="Local time of the hospital, without a zone."
+        default=None, description="Local time of the hospital."
     )
     station: str = Field(default="", description="The station that it is scheduled for.")
     modality: str = ""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ssl
 import threading
 from collections.abc import Callable
+from io import BytesIO
 from typing import Any
 
 from specimap_core.errors import SettingsError
@@ -100,10 +101,11 @@ def _bound(settings: ServiceSettings, event: Any) -> None:
 
 
 def _taken(settings: ServiceSettings, event: Any) -> int:
+    from pydicom import dcmread
+
     try:
-        dataset = event.dataset
-        dataset.file_meta = event.file_meta
-        return forwarded(settings, dataset)
+        # As a file has it: the data set alone would be handed on without its head.
+        return forwarded(settings, dcmread(BytesIO(event.encoded_dataset())))
     except Exception as error:
         # Without its text, which may hold a value.
         logger().warning("dicom object not read", error=type(error).__name__)
