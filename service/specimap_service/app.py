@@ -37,7 +37,7 @@ from specimap_service.context import CONTEXT, AppContext
 from specimap_service.contract.description import describe
 from specimap_service.head_requests import HeadRequests
 from specimap_service.hospital import dependencies as hospital
-from specimap_service.hospital import dicom_routes, fhir_routes, order_routes, study_routes
+from specimap_service.hospital import dicom_routes, fhir_routes, order_routes, stow_routes, study_routes
 from specimap_service.jobs import delivery_routes
 from specimap_service.jobs import dependencies as jobs
 from specimap_service.jobs import routes as job_routes
@@ -86,6 +86,7 @@ ROUTES = (
     order_routes,
     dicom_routes,
     fhir_routes,
+    stow_routes,
 )
 """Modules with a ``router``, in the order of the API's description."""
 

@@ -40,6 +40,7 @@ FILES = (
     ("POST", re.compile(r"/v1/acquisitions/[^/]+/files")),
     ("PATCH", re.compile(r"/v1/uploads/[^/]+")),
     ("PUT", re.compile(r"/v1/clouds/[^/]+/labels/[^/]+")),
+    ("POST", re.compile(r"/v1/dicomweb/studies")),
 )
 """Requests whose routes write the body to disk piece by piece."""
 WITHOUT_BODY = ("GET", "HEAD", "OPTIONS")

@@ -98,6 +98,8 @@ def make_world(service: Running, folder: Path, project: str, uploader: httpx.Cli
     if service.settings.study_keys:
         given = uploader.put(f"/v1/acquisitions/{owner}/study", json={"patient_id": "1"})
         assert given.status_code == 200, given.text
+    if service.settings.fhir_url:
+        assert uploader.post(f"/v1/clouds/{result.cloud_id}/fhir").status_code == 202
     upload = created(uploader, owner, "photo", 3).rpartition("/")[2]
     return World(
         {
@@ -272,6 +274,8 @@ CASES: dict[tuple[str, str], Case] = {
     ("POST", f"{CLOUD}/dicom"): Case("upload", 202, _json(), aims=True),
     ("POST", f"{CLOUD}/fhir"): Case("upload", 202, aims=True),
     ("GET", f"{CLOUD}/fhir"): _read(),
+    # Where it is off.
+    ("POST", "/v1/dicomweb/studies"): Case("upload", 404),
     # what ends something: each after all that needs it
     ("DELETE", "/v1/uploads/{uuid}"): Case("upload", 204, _tus(), aims=True),
     ("DELETE", f"{CLOUD}/shares/{{share_id}}"): Case("upload", 204, aims=True),

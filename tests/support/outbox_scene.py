@@ -97,14 +97,14 @@ def add_cloud(database: Database, settings: ServiceSettings) -> str:
 def small_objects(held: Claim, folder: Path, cancelled: Callable[[], bool], count: int = 3) -> list[DicomObject]:
     """Small pictures as the objects of a set."""
     from pydicom.dataset import FileDataset, FileMetaDataset
-    from pydicom.uid import ExplicitVRLittleEndian
+    from pydicom.uid import UID, ExplicitVRLittleEndian
 
     made = []
     study, series = derived_uid("study", held.cloud_id), derived_uid("series", held.cloud_id)
     for number in range(count):
         meta = FileMetaDataset()
-        meta.MediaStorageSOPClassUID = SECONDARY_CAPTURE
-        meta.MediaStorageSOPInstanceUID = derived_uid("instance", held.cloud_id, str(number))
+        meta.MediaStorageSOPClassUID = UID(SECONDARY_CAPTURE)
+        meta.MediaStorageSOPInstanceUID = UID(derived_uid("instance", held.cloud_id, str(number)))
         meta.TransferSyntaxUID = ExplicitVRLittleEndian
         dataset = FileDataset("", {}, file_meta=meta, preamble=b"\0" * 128)
         dataset.SOPClassUID, dataset.SOPInstanceUID = SECONDARY_CAPTURE, meta.MediaStorageSOPInstanceUID

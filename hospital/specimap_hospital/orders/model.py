@@ -21,9 +21,9 @@ class OrderQuery(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    accession_number: Short = Field("", description="Of the order.")
-    patient_id: Long = Field("", description="Of the patient.")
-    station: Short = Field("", description="Application entity title of the station that the step is scheduled for.")
+    accession_number: Short = Field(default="", description="Of the order.")
+    patient_id: Long = Field(default="", description="Of the patient.")
+    station: Short = Field(default="", description="Title of the station that the step is scheduled for.")
 
     @model_validator(mode="after")
     def _asks_for_something(self) -> OrderQuery:
@@ -37,10 +37,10 @@ class Order(BaseModel):
 
     source: Literal["worklist", "qido"] = Field(description="Where it was found.")
     study: StudyContext = Field(description="PUT it as the acquisition's study context to choose the order.")
-    scheduled_at: datetime.datetime | None = Field(None, description="Local time of the hospital, without a zone.")
-    station: str = Field("", description="The station that it is scheduled for.")
+    scheduled_at: datetime.datetime | None = Field(default=None, description="Local time of the hospital.")
+    station: str = Field(default="", description="The station that it is scheduled for.")
     modality: str = ""
-    description: str = Field("", description="Of the procedure.")
+    description: str = Field(default="", description="Of the procedure.")
 
 
 class Orders(BaseModel):

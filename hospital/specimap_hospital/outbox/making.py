@@ -136,10 +136,15 @@ def _fetch_result(storage: Storage, prefix: str, folder: Path, *, whole: bool) -
     if whole:
         storage.fetch(f"{prefix}/cloud.zarr", folder / "cloud.zarr")
     else:
-        for name in ("zarr.json", "spectra/zarr.json", *(array for array in ARRAYS if array != "spectra")):
-            storage.fetch(f"{prefix}/cloud.zarr/{name}", folder / "cloud.zarr" / name)
+        fetch_without_spectra(storage, prefix, folder)
     for name in FILES:
         storage.fetch(f"{prefix}/{name}", folder / name)
     for name in MAYBE:
         with suppress(NotFoundError):
             storage.fetch(f"{prefix}/{name}", folder / name)
+
+
+def fetch_without_spectra(storage: Storage, prefix: str, folder: Path) -> None:
+    """Fetch a cloud but for its spectra to ``folder / "cloud.zarr"``. Raises NotFoundError, StorageUnavailableError."""
+    for name in ("zarr.json", "spectra/zarr.json", *(array for array in ARRAYS if array != "spectra")):
+        storage.fetch(f"{prefix}/cloud.zarr/{name}", folder / "cloud.zarr" / name)

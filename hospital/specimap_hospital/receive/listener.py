@@ -1,4 +1,4 @@
-"""The DICOM port: C-ECHO, and the archive's reports of its commitment. Off unless a port is set.
+"""The DICOM port: C-ECHO, C-STORE, and the archive's reports of its commitment. Off unless a port is set.
 
 Only peers whose application entity title is named are heard. A title is no proof of who asks, so the port belongs on an
 inner network, or behind TLS with client certificates.
@@ -9,11 +9,14 @@ from __future__ import annotations
 import ssl
 import threading
 from collections.abc import Callable
+from io import BytesIO
 from typing import Any
 
 from specimap_core.errors import SettingsError
 from specimap_hospital.connections import entity
 from specimap_hospital.outbox.commitment import MODEL, take_report
+from specimap_hospital.receive.classes import CANNOT_UNDERSTAND, JPEG, PHOTOS, PLAIN, SEGMENTATIONS
+from specimap_hospital.receive.forward import forwarded
 from specimap_infra.database import Database, utc_now
 from specimap_infra.logs import logger
 from specimap_infra.settings import ServiceSettings
@@ -24,6 +27,7 @@ IDLE_SECONDS = 30.0
 RETRY_SECONDS = 5.0
 FAILED = 0x0110
 SUCCESS = 0x0000
+_COUNTED = "specimap_counted_bytes"
 
 
 def start_listener(database: Database, settings: ServiceSettings) -> Callable[[], None]:
@@ -40,10 +44,18 @@ def start_listener(database: Database, settings: ServiceSettings) -> Callable[[]
     # An empty list would let everybody in.
     ae.require_calling_aet = [title for title in (*settings.dicom_peers, settings.pacs_ae_title) if title] or ["\0"]
     ae.add_supported_context(VERIFICATION)
+    if settings.dicom_key:
+        for sop_class in SEGMENTATIONS:
+            ae.add_supported_context(sop_class, list(PLAIN))
+        for sop_class in PHOTOS:
+            ae.add_supported_context(sop_class, [*PLAIN, JPEG])
     # The archive reports as what it is, the provider of the commitment.
     ae.add_supported_context(MODEL, scu_role=False, scp_role=True)
     handlers: list[Any] = [
         (evt.EVT_C_ECHO, lambda event: SUCCESS),
+        (evt.EVT_C_STORE, lambda event: _taken(settings, event)),
+        (evt.EVT_PDU_RECV, lambda event: _bound(settings, event)),
+        (evt.EVT_DIMSE_RECV, lambda event: setattr(event.assoc, _COUNTED, 0)),
         (evt.EVT_N_EVENT_REPORT, lambda event: (_report(database, event), None)),
     ]
     context = _server_tls(settings)
@@ -59,6 +71,7 @@ def start_listener(database: Database, settings: ServiceSettings) -> Callable[[]
                 logger().error("dicom port not listened on", port=settings.dicom_port, error=error.strerror)
                 ended.wait(RETRY_SECONDS)
             else:
+                assert made is not None
                 servers.append(made)
                 logger().info("dicom port", host=settings.dicom_host, port=settings.dicom_port)
                 return
@@ -73,6 +86,30 @@ def start_listener(database: Database, settings: ServiceSettings) -> Callable[[]
             server.shutdown()
 
     return stop
+
+
+def _bound(settings: ServiceSettings, event: Any) -> None:
+    """End an association that sends more in one message than an object may have."""
+    from pynetdicom.pdu import P_DATA_TF
+
+    if isinstance(event.pdu, P_DATA_TF):
+        counted = getattr(event.assoc, _COUNTED, 0) + event.pdu.pdu_length
+        setattr(event.assoc, _COUNTED, counted)
+        if counted > settings.most_dicom_bytes:
+            logger().warning("dicom object too large", limit_bytes=settings.most_dicom_bytes)
+            event.assoc.abort()
+
+
+def _taken(settings: ServiceSettings, event: Any) -> int:
+    from pydicom import dcmread
+
+    try:
+        # As a file has it: the data set alone would be handed on without its head.
+        return forwarded(settings, dcmread(BytesIO(event.encoded_dataset())))
+    except Exception as error:
+        # Without its text, which may hold a value.
+        logger().warning("dicom object not read", error=type(error).__name__)
+        return CANNOT_UNDERSTAND
 
 
 def _report(database: Database, event: Any) -> int:

@@ -97,7 +97,19 @@ class HospitalSettings(StudySettings):
         description="Application entity titles that may use the DICOM port besides the archive's, as a JSON list.",
     )
 
-    @field_validator("orders_url", "pacs_url")
+    dicom_key: str = Field(
+        default="",
+        description="Key (`spk_...`) with the scopes `upload` and `label` with which the DICOM port hands on what it is sent by C-STORE; without one it takes nothing.",
+    )
+    dicom_forward_url: str = Field(
+        default="", description="Address of the API that it hands that to; by default that of this machine's service."
+    )
+    stow: Literal["off", "on"] = Field(default="off", description="Whether the API takes DICOM objects (STOW-RS).")
+    most_dicom_bytes: int = Field(
+        default=256 * 1024**2, ge=1, description="Largest DICOM object, and STOW-RS body, that is taken."
+    )
+
+    @field_validator("orders_url", "pacs_url", "dicom_forward_url")
     @classmethod
     def _web_address(cls, value: str) -> str:
         if value and (not value.startswith(("http://", "https://")) or "@" in value.split("/")[2]):

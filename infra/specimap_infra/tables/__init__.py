@@ -8,7 +8,7 @@ from specimap_infra.tables.audit import AuditCursor, AuditEntry, AuditHead
 from specimap_infra.tables.base import Base, UtcDateTime
 from specimap_infra.tables.clouds import CloudRow, Export, LabelVersion
 from specimap_infra.tables.fhir import FhirNotice
-from specimap_infra.tables.hospital import DicomInstance, DicomSet, SealedStudy
+from specimap_infra.tables.hospital import DicomInstance, DicomSet, ReceivedStudy, SealedStudy
 from specimap_infra.tables.jobs import Artefact, Delivery, Job, JobEvent, Lease, RepeatableRequest
 from specimap_infra.tables.names import DICOM_STATES, FINAL_STATES, JOB_STATES, PRIORITIES, QUEUED, ROLES, SCOPES
 from specimap_infra.tables.people import Person, SignInAttempt
@@ -43,6 +43,7 @@ __all__ = [
     "LegalHold",
     "Person",
     "Project",
+    "ReceivedStudy",
     "RepeatableRequest",
     "SealedStudy",
     "Share",

@@ -80,3 +80,13 @@ class DicomInstance(Base):
     """Counted before it is sent: where one was under way when its sender died, the archive may have it."""
     reason: Mapped[str | None]
     sent_at: Mapped[datetime.datetime | None]
+
+
+class ReceivedStudy(Base):
+    """A study of which photos were received: they all go to one acquisition."""
+
+    __tablename__ = "received_studies"
+
+    digest: Mapped[str] = mapped_column(primary_key=True)
+    """Of the project and the study's UID, which is kept in the study context alone."""
+    acquisition_id: Mapped[str] = owned_by("acquisitions")

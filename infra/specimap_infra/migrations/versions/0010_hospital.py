@@ -79,10 +79,24 @@ def upgrade() -> None:
     )
     op.create_index(op.f("ix_dicom_instances_set_id"), "dicom_instances", ["set_id"])
     op.create_index(op.f("ix_dicom_instances_sop_instance_uid"), "dicom_instances", ["sop_instance_uid"])
+    op.create_table(
+        "received_studies",
+        sa.Column("digest", sa.String(), nullable=False),
+        sa.Column("acquisition_id", sa.String(), nullable=False),
+        sa.ForeignKeyConstraint(
+            ["acquisition_id"],
+            ["acquisitions.id"],
+            name=op.f("fk_received_studies_acquisition_id_acquisitions"),
+            ondelete="CASCADE",
+        ),
+        sa.PrimaryKeyConstraint("digest", name=op.f("pk_received_studies")),
+    )
+    op.create_index(op.f("ix_received_studies_acquisition_id"), "received_studies", ["acquisition_id"])
 
 
 def downgrade() -> None:
     """Revert."""
+    op.drop_table("received_studies")
     op.drop_table("dicom_instances")
     op.drop_table("dicom_sets")
     op.drop_table("studies")
