@@ -275,7 +275,7 @@ CASES: dict[tuple[str, str], Case] = {
     ("POST", f"{CLOUD}/fhir"): Case("upload", 202, aims=True),
     ("GET", f"{CLOUD}/fhir"): _read(),
     # Where it is off.
-    ("POST", "/v1/dicomweb/studies"): Case("upload", 404),
+    ("POST", "/v1/dicomweb/studies"): Case(None, 404),
     # what ends something: each after all that needs it
     ("DELETE", "/v1/uploads/{uuid}"): Case("upload", 204, _tus(), aims=True),
     ("DELETE", f"{CLOUD}/shares/{{share_id}}"): Case("upload", 204, aims=True),

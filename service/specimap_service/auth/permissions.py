@@ -96,7 +96,8 @@ OPERATIONS: dict[str, str | None] = {
     "dicom.get_archive": STUDY,
     "dicom.list": READ,
     "dicom.create": SEND,
-    "dicomweb.create": CAPTURE,
+    # By object: photos need one permission, segmentations another.
+    "dicomweb.create": None,
     "erasures.create": ERASE,
     "erasures.list": ERASE,
     "exports.create": READ,

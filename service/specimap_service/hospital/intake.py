@@ -39,6 +39,7 @@ from specimap_service.acquisitions.intake import take_in
 from specimap_service.acquisitions.judge import Judge
 from specimap_service.auth.access import in_sight
 from specimap_service.auth.keys import Principal
+from specimap_service.auth.permissions import CAPTURE, LABEL
 from specimap_service.clouds.label_body import LabelMetadata
 from specimap_service.clouds.label_store import Conditions, put_label
 from specimap_service.clouds.open_clouds import OpenClouds
@@ -101,7 +102,7 @@ class Intake:
     # ---- segmentations --------------------------------------------------------------------------------
 
     def _label(self, found: dict[str, Any], folder: Path) -> None:
-        if not self.principal.may("label"):
+        if not self.principal.may(LABEL):
             raise UnreadableError(NOT_AUTHORISED)
         with self.context.database.session() as session:
             cloud = self._referenced(session, [str(uid) for uid in found["references"]])
@@ -137,6 +138,9 @@ class Intake:
     # ---- photos ---------------------------------------------------------------------------------------
 
     def _photo(self, found: dict[str, Any], folder: Path) -> None:
+        # In which of several projects an acquisition belongs, an object does not say.
+        if not self.principal.may(CAPTURE) or len(self.principal.project_ids) != 1:
+            raise UnreadableError(NOT_AUTHORISED)
         photo = folder / Path(str(found["file"])).name
         content = photo.read_bytes()
         if len(content) > self.context.settings.max_photo_bytes:
@@ -163,7 +167,7 @@ class Intake:
 
     def _acquisition(self, study_uid: str, study: dict[str, Any] | None) -> str:
         """The acquisition of a study's photos, new for the first one."""
-        digest = hashlib.sha256(f"{self.principal.project_id}/{study_uid}".encode()).hexdigest()
+        digest = hashlib.sha256(f"{self.principal.project_ids[0]}/{study_uid}".encode()).hexdigest()
         for _ in range(2):
             try:
                 with self.context.database.session() as session:
@@ -178,7 +182,7 @@ class Intake:
     def _new_acquisition(self, session: Session, digest: str, study: dict[str, Any] | None) -> str:
         row = Acquisition(
             id=new_id("acq"),
-            project_id=self.principal.project_id,
+            project_id=self.principal.project_ids[0],
             specimen_id=f"dicom-{digest[:16]}",
             dictionary=DEFAULTS.dictionary,
             edge_mm=DEFAULTS.edge_mm,

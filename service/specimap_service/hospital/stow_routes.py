@@ -48,9 +48,9 @@ async def receive_dicom(
 ) -> JSONResponse:
     """Take DICOM objects in (STOW-RS).
 
-    A Segmentation of a result's top view becomes a label layer of that result; the key needs the scope `label` for it.
-    Photos (VL Photographic Image, Secondary Capture) of a study become an acquisition. All else is refused: with 409
-    where nothing was taken, in the form of 202.
+    A Segmentation of a result's top view becomes a label layer of that result, which takes the scope `label`. Photos
+    (VL Photographic Image, Secondary Capture) of a study become an acquisition, which takes `upload`. All else is
+    refused: with 409 where nothing was taken, in the form of 202.
     """
     if context.settings.stow == "off":
         raise NotFoundError(
