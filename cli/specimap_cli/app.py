@@ -14,6 +14,7 @@ from specimap_cli import run_options
 from specimap_cli.backup import backup, restore
 from specimap_cli.doctor import doctor
 from specimap_cli.errors import Debug, reported_errors, stoppable
+from specimap_cli.identity import identity_app
 from specimap_cli.keys import keys_app
 from specimap_cli.phantom import phantom
 from specimap_cli.progress import Listener, json_listener, progress_listener
@@ -221,6 +222,7 @@ app.command()(doctor)
 app.command()(backup)
 app.command()(restore)
 app.add_typer(study_app, name="study")
+app.add_typer(identity_app, name="identity")
 app.add_typer(keys_app, name="keys")
 app.add_typer(projects_app, name="projects")
 app.add_typer(storage_app, name="storage")

@@ -38,7 +38,7 @@ class Rules:
 
 def invalid(reason: str, told: str) -> TokenInvalidError:
     """Make the error for a token that does not count; ``reason`` is a stable word."""
-    return TokenInvalidError(f"The access token does not count: {told}.", advice=_ADVICE, reason=reason)
+    return TokenInvalidError(f"The token does not count: {told}.", advice=_ADVICE, reason=reason)
 
 
 def access_claims(provider: Provider, token: str, rules: Rules) -> dict[str, Any]:
@@ -55,7 +55,14 @@ def access_claims(provider: Provider, token: str, rules: Rules) -> dict[str, Any
         or any(name in claims for name in OF_SIGN_IN)
         or claims.get("typ") in ("ID", "Refresh")
     ):
-        raise invalid("type", "it is no access token")
+        raise invalid("type", "it is an ID token or another, and no access token")
+    _check(claims, rules, provider.issuer)
+    return claims
+
+
+def checked_claims(provider: Provider, token: str, rules: Rules) -> dict[str, Any]:
+    """Return the claims of a token of either kind, for an administrator who looks at one. Raises as :func:`access_claims`."""
+    _, claims = signed(provider, token, rules.algorithms)
     _check(claims, rules, provider.issuer)
     return claims
 
@@ -71,7 +78,7 @@ def id_claims(provider: Provider, token: str, rules: Rules, *, nonce: str, acces
     try:
         CodeIDToken(claims, header, {}, wanted).validate(leeway=int(rules.skew_seconds))
     except JoseError as error:
-        raise invalid("claims", f"a claim of the ID token is wrong ({error.error})") from error
+        raise invalid("claims", f"a claim of the ID token is wrong ({error})") from error
     return claims
 
 
@@ -147,7 +154,7 @@ def _check(claims: dict[str, Any], rules: Rules, issuer: str) -> None:
     try:
         registry.validate(claims)
     except ExpiredTokenError as error:
-        raise TokenExpiredError("The access token has expired.", advice=_ADVICE, reason="expired") from error
+        raise TokenExpiredError("The token has expired.", advice=_ADVICE, reason="expired") from error
     except (InvalidClaimError, MissingClaimError) as error:
         reasons = {"iss": "issuer", "aud": "audience", "nbf": "not_yet_valid", "iat": "not_yet_valid"}
         raise invalid(reasons.get(error.claim, "claims"), f"its claim {error.claim} is missing or wrong") from error
