@@ -7,6 +7,7 @@ import socket
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 import sqlalchemy as sa
@@ -45,7 +46,7 @@ def hospital(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hospital]:
         provider.add_user("john", "quality")
         provider.add_user("guest")
         provider.add_client(url)
-        settings: dict[str, object] = {
+        settings: dict[str, Any] = {
             "oidc_issuer": provider.issuer,
             "oidc_client_id": CLIENT_ID,
             "oidc_client_secret": CLIENT_SECRET,
@@ -87,9 +88,8 @@ def test_a_technician_signs_in_comes_back_and_signs_out(window: Window, hospital
     assert page.get_by_role("link", name="Administration").count() == 0
     assert page.evaluate("document.cookie") == ""
     with hospital.service.database.session() as session:
-        person = session.scalars(
-            sa.select(Person).where(Person.subject_hash == subject_hash(hospital.provider.issuer, "jane"))
-        ).one()
+        own = Person.subject_hash == subject_hash(hospital.provider.issuer, "jane")
+        person = session.scalars(sa.select(Person).where(own)).one()
         assert session.scalar(sa.select(AuditEntry.action).where(AuditEntry.target == person.id)) == "session.create"
 
     page.get_by_role("button", name="Sign out").click()
@@ -125,7 +125,7 @@ def test_an_account_without_a_role_is_told_so(window: Window, hospital: Hospital
 
 def test_while_the_provider_is_away_a_key_signs_in(window: Window, tmp_path: Path) -> None:
     port = free_port()
-    settings: dict[str, object] = {
+    settings: dict[str, Any] = {
         "oidc_issuer": f"http://127.0.0.1:{free_port()}",
         "oidc_client_id": CLIENT_ID,
         "public_url": f"http://127.0.0.1:{port}",

@@ -34,7 +34,7 @@ def check_identity(settings: ServiceSettings, token: str | None = None) -> Itera
     if not settings.oidc_issuer:
         raise SettingsError(
             "No identity provider is configured.",
-            advice="Set SPECIMAP_OIDC_ISSUER, SPECIMAP_OIDC_CLIENT_ID and SPECIMAP_PUBLIC_URL; docs/identity.md shows how.",
+            advice="Set SPECIMAP_OIDC_ISSUER and what goes with it; docs/identity.md shows how.",
             setting="oidc_issuer",
         )
     with provider_client(settings.oidc_ca_file) as client:
@@ -56,9 +56,7 @@ def _of_description(settings: ServiceSettings, described: Description) -> Iterat
         for algorithm in settings.oidc_algorithms
         if any(isinstance(key, KIND_OF[algorithm[:2]]) for key in described.keys)
     ]
-    yield Finding(
-        "keys", bool(usable), f"{len(described.keys)} keys, for {', '.join(usable) or 'no allowed signature'}"
-    )
+    yield Finding("keys", bool(usable), f"{len(described.keys)}, for {', '.join(usable) or 'no allowed signature'}")
     signs = described.says("id_token_signing_alg_values_supported")
     if signs and not set(signs) & set(settings.oidc_algorithms):
         yield Finding("signatures", False, f"it signs with {', '.join(signs)}, none of SPECIMAP_OIDC_ALGORITHMS")

@@ -61,7 +61,7 @@ def access_claims(provider: Provider, token: str, rules: Rules) -> dict[str, Any
 
 
 def checked_claims(provider: Provider, token: str, rules: Rules) -> dict[str, Any]:
-    """Return the claims of a token of either kind, for an administrator who looks at one. Raises as :func:`access_claims`."""
+    """Return the claims of a token of either kind, for one who looks at it. Raises as :func:`access_claims`."""
     _, claims = signed(provider, token, rules.algorithms)
     _check(claims, rules, provider.issuer)
     return claims
