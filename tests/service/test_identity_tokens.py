@@ -7,7 +7,7 @@ import hmac
 import json
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, get_args
 
 import httpx
 import pytest
@@ -18,7 +18,7 @@ from specimap_infra.tables import Person
 from specimap_service.auth import dependencies
 from specimap_service.auth.oidc.identity import Identity
 from specimap_service.auth.oidc.provider import AGAIN_SECONDS, FRESH_SECONDS, KEPT_SECONDS
-from specimap_service.auth.oidc.tokens import LARGEST_TOKEN
+from specimap_service.auth.oidc.tokens import LARGEST_TOKEN, Reason
 from specimap_service.auth.people import subject_hash
 from tests.support.documented import check_refusal
 from tests.support.identity_provider import AUDIENCE, Provider, provider_running, signed
@@ -262,6 +262,10 @@ HOSTILE: dict[str, tuple[str, str, Maker]] = {
     "refresh token": (INVALID, "type", with_claims(typ="Refresh")),
     "other type": (INVALID, "type", with_header(typ="secevent+jwt")),
 }
+
+
+def test_every_reason_has_its_hostile_token() -> None:
+    assert {reason for _, reason, _ in HOSTILE.values()} == set(get_args(Reason))
 
 
 @pytest.mark.parametrize("name", HOSTILE)

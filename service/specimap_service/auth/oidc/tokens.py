@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from authlib.oidc.core import CodeIDToken
 from joserfc import jws
@@ -20,6 +20,21 @@ LONGEST_ID = 255
 """Of a key, and of an account: OpenID Connect allows no longer one."""
 OF_SIGN_IN = ("nonce", "at_hash", "c_hash", "s_hash")
 """Claims that an ID token has, which says who signed in on a page, and an access token has not."""
+Reason = Literal[
+    "algorithm",
+    "audience",
+    "claims",
+    "expired",
+    "issuer",
+    "malformed",
+    "not_yet_valid",
+    "signature",
+    "too_large",
+    "type",
+    "unknown_key",
+]
+"""Why a token does not count, in stable words that docs/identity.md explains."""
+_OF_CLAIMS: dict[str, Reason] = {"iss": "issuer", "aud": "audience", "nbf": "not_yet_valid", "iat": "not_yet_valid"}
 _ADVICE = "Get a new access token from the identity provider, for the audience of this service."
 
 
@@ -36,8 +51,8 @@ class Rules:
     skew_seconds: float
 
 
-def invalid(reason: str, told: str) -> TokenInvalidError:
-    """Make the error for a token that does not count; ``reason`` is a stable word."""
+def invalid(reason: Reason, told: str) -> TokenInvalidError:
+    """Make the error for a token that does not count."""
     return TokenInvalidError(f"The token does not count: {told}.", advice=_ADVICE, reason=reason)
 
 
@@ -156,8 +171,7 @@ def _check(claims: dict[str, Any], rules: Rules, issuer: str) -> None:
     except ExpiredTokenError as error:
         raise TokenExpiredError("The token has expired.", advice=_ADVICE, reason="expired") from error
     except (InvalidClaimError, MissingClaimError) as error:
-        reasons = {"iss": "issuer", "aud": "audience", "nbf": "not_yet_valid", "iat": "not_yet_valid"}
-        raise invalid(reasons.get(error.claim, "claims"), f"its claim {error.claim} is missing or wrong") from error
+        raise invalid(_OF_CLAIMS.get(error.claim, "claims"), f"its claim {error.claim} is missing or wrong") from error
     except (JoseError, TypeError, ValueError, OverflowError) as error:
         raise invalid("claims", "its claims do not read") from error
     subject = claims["sub"]
