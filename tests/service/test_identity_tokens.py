@@ -113,6 +113,7 @@ def test_what_a_token_permits_is_what_its_roles_permit(service: Running, provide
         ({}, {"exp": -10}),
         ({}, {"nbf": 10}),
         ({}, {"roles": "specimap-technician"}),
+        ({}, {"typ": "Bearer", "nonce": "of the sign-in"}),
         ({}, {"roles": {"specimap-technician": {"org": "x"}}}),
     ],
 )
