@@ -80,7 +80,6 @@ def test_a_technician_signs_in_comes_back_and_signs_out(window: Window, hospital
     page.goto(f"{url}/#/jobs")
     expect(page.get_by_test_id("sign-in-account")).to_have_text("Sign in with your account of St. Example")
     assert window.faults() == []
-    window.picture("sign-in")
     sign_in(page, "jane")
     expect(page.get_by_role("heading", name="Jobs")).to_be_visible()
     assert page.url == f"{url}/#/jobs"
