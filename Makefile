@@ -4,7 +4,7 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup pages learned path-traced demo test test-pages test-fast lint bench bench-service check-images clean
+.PHONY: help setup identity-provider pages learned path-traced demo test test-pages test-fast lint bench bench-service check-images clean
 
 PYTHON ?= python3
 VENV := .venv
@@ -24,6 +24,7 @@ help:
 	@echo "make setup   install the pinned versions into $(VENV), and build the web pages"
 	@echo "make learned add PyTorch and the learned features"
 	@echo "make path-traced add Mitsuba, for path-traced phantoms"
+	@echo "make identity-provider add Canaille, at which the tests sign in, in an environment of its own"
 	@echo "make demo    set up, then run samples/ through a service of its own into $(DEMO_OUT)"
 	@echo "make test    set up, with the learned features, then run all tests"
 	@echo "make test-pages   the tests of the web pages that need no service"
@@ -35,6 +36,13 @@ help:
 	@echo "make clean   remove $(VENV), web/node_modules, the built pages and out/"
 
 setup: $(STAMP) pages
+
+# In an environment of its own, since it pins what it needs.
+identity-provider: .venv-canaille/bin/canaille
+
+.venv-canaille/bin/canaille:
+	@"$(PYTHON)" -m venv .venv-canaille
+	@.venv-canaille/bin/pip install --quiet --disable-pip-version-check "canaille[front,oidc,server,sqlite]==0.3.6"
 
 pages: $(PAGES)
 
@@ -109,4 +117,4 @@ check-images:
 	docker/check_images.sh
 
 clean:
-	rm -rf $(VENV) out web/node_modules service/specimap_service/pages
+	rm -rf $(VENV) .venv-canaille out web/node_modules service/specimap_service/pages

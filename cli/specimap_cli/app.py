@@ -17,6 +17,7 @@ from specimap_cli.contexts import contexts_app
 from specimap_cli.doctor import doctor
 from specimap_cli.erasure import erase, verify_certificate
 from specimap_cli.errors import Debug, reported_errors, stoppable
+from specimap_cli.identity import identity_app
 from specimap_cli.keys import keys_app
 from specimap_cli.phantom import phantom
 from specimap_cli.progress import Listener, json_listener, progress_listener
@@ -235,6 +236,7 @@ app.command()(restore)
 app.command()(erase)
 app.command(name="verify-certificate")(verify_certificate)
 app.add_typer(study_app, name="study")
+app.add_typer(identity_app, name="identity")
 app.add_typer(keys_app, name="keys")
 app.add_typer(contexts_app, name="contexts")
 app.add_typer(projects_app, name="projects")

@@ -36,7 +36,7 @@ def page_part() -> str:
     return f"{settings_table()}\n\n{OF_BACKENDS}\n\n{backends_table()}"
 
 
-FILES = ("_ca", "_certificate", "_key")
+FILES = ("_ca", "_certificate", "_key", "_file")
 """Endings of the names of settings that name a file."""
 
 

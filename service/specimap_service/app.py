@@ -52,7 +52,7 @@ from specimap_service.uploads import routes as upload_routes
 DESCRIPTION = """\
 Photos and one hyperspectral cube of an excised specimen to a metric 3D point cloud in which every point carries its
 spectrum. Every call but `/healthz` and `/readyz` takes a key: `Authorization: Bearer spk_…`; on the service's own pages
-a person signs in with one instead. Errors are
+a person signs in with one instead, or, where the service has an identity provider, with a hospital account. Errors are
 `application/problem+json` with a stable code and advice. HEAD works wherever GET does. A query parameter that an
 operation does not know is refused. Within `/v1` the contract only grows.
 """

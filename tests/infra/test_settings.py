@@ -80,6 +80,15 @@ def test_values_come_from_a_file_and_the_environment_wins(tmp_path: Path, monkey
         ("STORAGE", "s3://", "s3://BUCKET"),
         ("LOG_LEVEL", "loud", "'info'"),
         ("JUDGE_MEMORY_BYTES", "1000", "268435456"),
+        ("OIDC_ISSUER", "http://login.test", "https://"),
+        ("OIDC_ISSUER", "https://login.test?x=1", "without a query"),
+        ("OIDC_ISSUER", "https://login.test", "SPECIMAP_OIDC_CLIENT_ID"),
+        ("OIDC_SCOPES", "profile", "openid"),
+        ("OIDC_ALGORITHMS", '["RS256", "HS256"]', "RS256"),
+        ("OIDC_ALGORITHMS", '["none"]', "RS256"),
+        ("OIDC_ALGORITHMS", "[]", "RS256"),
+        ("OIDC_ROLES", '{"lab": "surgeon"}', "technician"),
+        ("OIDC_CLOCK_SKEW_SECONDS", "3600", "300"),
     ],
 )
 def test_a_wrong_value_is_refused_by_its_variables_name(
@@ -89,6 +98,17 @@ def test_a_wrong_value_is_refused_by_its_variables_name(
     error = refused()
     assert error.message.startswith(f"SPECIMAP_{name}: ")
     assert says in error.message
+
+
+def test_a_provider_needs_the_address_to_which_it_sends_people_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = {"oidc_issuer": "https://login.test", "oidc_client_id": "specimap"}
+    assert "SPECIMAP_PUBLIC_URL" in refused(**given).message
+    assert "SPECIMAP_PUBLIC_URL" in refused(**given, public_url="http://specimap.test").message
+    settings = load_settings(**given, public_url="https://specimap.test", oidc_client_secret="hidden")
+    assert settings.oidc_issuer == "https://login.test"
+    assert "hidden" not in repr(settings)
+    monkeypatch.setenv("SPECIMAP_OIDC_ROLES", '{"lab": "technician"}')
+    assert load_settings().oidc_roles == {"lab": "technician"}
 
 
 def test_a_list_that_is_no_json_is_refused_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import base64
 import hmac
 import json
+import random
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, get_args
 
 import httpx
 import pytest
@@ -18,8 +19,9 @@ from specimap_infra.tables import Person
 from specimap_service.auth import dependencies
 from specimap_service.auth.oidc.identity import Identity
 from specimap_service.auth.oidc.provider import AGAIN_SECONDS, FRESH_SECONDS, KEPT_SECONDS
-from specimap_service.auth.oidc.tokens import LARGEST_TOKEN
+from specimap_service.auth.oidc.tokens import LARGEST_TOKEN, Reason, access_claims
 from specimap_service.auth.people import subject_hash
+from specimap_service.errors import TokenExpiredError, TokenInvalidError
 from tests.support.documented import check_refusal
 from tests.support.identity_provider import AUDIENCE, Provider, provider_running, signed
 from tests.support.plain_http import NO_TLS
@@ -113,6 +115,7 @@ def test_what_a_token_permits_is_what_its_roles_permit(service: Running, provide
         ({}, {"exp": -10}),
         ({}, {"nbf": 10}),
         ({}, {"roles": "specimap-technician"}),
+        ({}, {"typ": "Bearer", "nonce": "of the sign-in"}),
         ({}, {"roles": {"specimap-technician": {"org": "x"}}}),
     ],
 )
@@ -264,6 +267,10 @@ HOSTILE: dict[str, tuple[str, str, Maker]] = {
 }
 
 
+def test_every_reason_has_its_hostile_token() -> None:
+    assert {reason for _, reason, _ in HOSTILE.values()} == set(get_args(Reason))
+
+
 @pytest.mark.parametrize("name", HOSTILE)
 def test_hostile_tokens_are_refused(service: Running, provider: Provider, name: str) -> None:
     code, reason, make = HOSTILE[name]
@@ -272,6 +279,21 @@ def test_hostile_tokens_are_refused(service: Running, provider: Provider, name: 
     assert answer.json()["details"] == {"reason": reason}
     assert answer.headers["www-authenticate"] == "Bearer"
     assert answer.json()["advice"]
+
+
+def test_no_change_to_a_token_counts(service: Running, provider: Provider) -> None:
+    rules, known = identity_of(service).rules(AUDIENCE), identity_of(service).provider
+    token, chance = provider.token(), random.Random(7)
+    assert access_claims(known, token, rules)["sub"] == "alice"
+    letters = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_.=%\0 "
+    for _ in range(1000):
+        # The last letter of the signature holds bits that say nothing.
+        at, letter = chance.randrange(len(token) - 1), chance.choice(letters)
+        changed = chance.choice([token[:at] + letter + token[at + 1 :], token[:at], token[:at] + letter + token[at:]])
+        if changed == token:
+            continue
+        with pytest.raises((TokenInvalidError, TokenExpiredError)):
+            access_claims(known, changed, rules)
 
 
 def test_no_address_in_a_token_is_asked(service: Running, provider: Provider) -> None:

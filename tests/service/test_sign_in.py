@@ -210,6 +210,13 @@ def test_the_host_that_a_request_names_does_not_count(service: Running) -> None:
     assert asked["redirect_uri"] == [f"{service.url}/v1/sso/callback"]
 
 
+def test_behind_tls_cookies_are_of_this_host_alone(service: Running) -> None:
+    begun = client_of(service).get("/v1/sso/login", headers={"X-Forwarded-Proto": "https"})
+    (cookie,) = SimpleCookie(begun.headers["set-cookie"]).values()
+    assert cookie.key == "__Host-specimap_sign_in"
+    assert (cookie["secure"], cookie["path"], cookie["domain"]) == (True, "/", "")
+
+
 def test_an_answer_counts_in_the_browser_that_asked_alone(service: Running, provider: Provider) -> None:
     attacker, victim = client_of(service), client_of(service)
     back = at_provider(attacker.get("/v1/sso/login").headers["location"])

@@ -37,7 +37,7 @@ class Window:
         """Open the pages and sign in."""
         self.page.goto(url)
         self.page.get_by_label("Key", exact=True).fill(key)
-        self.page.get_by_role("button", name="Sign in").click()
+        self.page.get_by_role("button", name="Sign in", exact=True).click()
         expect(self.page.get_by_role("button", name="Sign out")).to_be_visible()
 
     def picture(self, name: str) -> bytes:

@@ -66,7 +66,7 @@ class Provider:
         key = key or self.keys[0]
         return signed({"alg": "RS256", "kid": key.kid, **(header or {})}, json.dumps(self.claims(**more)), key)
 
-    def settings(self, public_url: str, **more: object) -> dict[str, object]:
+    def settings(self, public_url: str, **more: Any) -> dict[str, Any]:
         """Settings of a service that uses it."""
         own = {
             "oidc_issuer": self.issuer,

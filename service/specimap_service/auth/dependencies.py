@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Annotated
 
 import structlog
@@ -49,7 +50,17 @@ def _open(app: FastAPI, context: AppContext) -> None:
     ACCESS.set(app, Access(context.database))
 
 
-FEATURE = Feature(_open)
+@asynccontextmanager
+async def _running(app: FastAPI) -> AsyncIterator[None]:
+    try:
+        yield
+    finally:
+        identity = IDENTITY.of(app)
+        if identity is not None:
+            identity.close()
+
+
+FEATURE = Feature(_open, _running)
 KeyringDep = Annotated[Keyring, Depends(KEYRING.of_request)]
 AccessDep = Annotated[Access, Depends(ACCESS.of_request)]
 PRINCIPAL = "specimap.principal"

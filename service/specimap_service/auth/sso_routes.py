@@ -106,7 +106,7 @@ def finish_sign_in(
         token, seconds = _begin_session(context, identity, finished)
     except (SignInRefusedError, IdentityUnavailableError) as refusal:
         reason = str(refusal.details.get("reason", refusal.code))
-        logger().warning("sign-in refused", reason=reason)
+        logger().warning("sign-in refused", reason=reason, told=refusal.message)
         answer = _to_page(identity, f"#/?sso={reason}")
     else:
         keyring.forget()

@@ -9,10 +9,12 @@ import sqlalchemy as sa
 from sqlalchemy.orm import Session
 
 from specimap_core.errors import SpecimapError
+from specimap_infra.housekeeping import AUDITED_AS
 from specimap_infra.logs import logger
 from specimap_infra.projects import named, new_project
 from specimap_infra.settings import ServiceSettings
 from specimap_infra.tables import Project
+from specimap_service.context import audit
 
 MOST_VALUES = 2000
 """Values of a claim that are looked at."""
@@ -68,7 +70,9 @@ def _project(session: Session, wanted: str, *, create: bool) -> str | None:
     if create:
         try:
             with session.begin_nested():
-                return new_project(session, wanted).id
+                made = new_project(session, wanted).id
+                audit(session, AUDITED_AS, "project.create", made)
+                return made
         except SpecimapError as error:
             # The group's name is no name of a project, or another request makes the project at this moment.
             logger().warning("group gives no project", code=error.code)

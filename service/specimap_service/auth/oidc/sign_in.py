@@ -123,7 +123,7 @@ def finish(identity: Identity, database: Database, answer: Mapping[str, str], br
             access_token=tokens.get("access_token"),
         )
     except (TokenInvalidError, TokenExpiredError) as error:
-        told = f"The identity provider's answer does not count ({error.details['reason']})."
+        told = f"The identity provider's answer does not count. {error.message}"
         raise refused(
             "token_invalid", told, "Ask whoever runs the service: its settings or clock may be wrong."
         ) from error
