@@ -49,6 +49,8 @@ MOST_REFUSED = 30
 SEVERAL = "several"
 """Action of an entry that stands for refused requests of several kinds."""
 STOP_SECONDS = 5.0
+AWAY_SECONDS = 1.0
+"""Pause after the database did not take the entries."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,8 @@ class AuditTrail:
         self._refused_until = 0.0
         self._wake, self._stop = threading.Event(), threading.Event()
         self._flushing = threading.Lock()
+        self._away = False
+        """Whether the log has told that the database is away."""
         self._thread = threading.Thread(target=self._run, name="audit", daemon=True)
 
     # ---- requests ---------------------------------------------------------------------------------------
@@ -203,12 +207,15 @@ class AuditTrail:
             self.addresses.prepare()
             self.flush(everything=everything)
             seal(self._database, self._keys)
+            self._away = False
         except SpecimapError as error:
-            logger().warning("the audit trail waits", code=error.code, entries=len(self._waiting))
-            self._stop.wait(1.0)
+            if not self._away:
+                logger().warning("the audit trail waits", code=error.code, entries=len(self._waiting))
+            self._away = True
+            self._stop.wait(AWAY_SECONDS)
         except Exception:
             logger().exception("the audit trail waits", entries=len(self._waiting))
-            self._stop.wait(1.0)
+            self._stop.wait(AWAY_SECONDS)
 
     def flush(self, *, everything: bool = False) -> None:
         """Write what waits, and counts whose interval is over, or all.

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 from typing import Any
+
+import httpx
+import pytest
 
 from specimap_infra.audit.triggers import drop_triggers
 from specimap_infra.database import Database
 from specimap_infra.migrate import migrate
 from specimap_infra.settings import load_settings
 from specimap_infra.tables import AuditEntry
-from tests.support.backup_scene import specimap
+from tests.support.backup_scene import specimap, started
 
 
 def service_with(folder: Path, count: int) -> tuple[dict[str, Any], Database]:
@@ -60,3 +64,23 @@ def test_what_is_refused(tmp_path: Path) -> None:
     assert (short.returncode, "32 characters" in short.stderr) == (2, True)
     none = specimap({"data_dir": tmp_path / "other"}, "audit", "verify")
     assert none.returncode == 2
+
+
+@pytest.mark.waits
+def test_what_was_answered_a_second_ago_outlives_a_killed_service(tmp_path: Path) -> None:
+    given = {"data_dir": tmp_path / "data", "port": 0, "min_free_bytes": 0}
+    key = specimap(given, "keys", "create", "--name", "reader", "--scope", "read").stdout.strip()
+    with started(given, "serve", "--no-worker") as program:
+        assert program.stdout is not None
+        url = next(line.split()[-1] for line in program.stdout if "listens on" in line)
+        for path in ("/v1/jobs", "/v1/clouds"):
+            answer = httpx.get(url + path, headers={"Authorization": f"Bearer {key}"}, trust_env=False)
+            assert answer.status_code == 200
+        assert httpx.get(f"{url}/v1/keys", trust_env=False).status_code == 401
+        time.sleep(2)
+        program.kill()
+        program.wait(20)
+    lines = specimap(given, "audit", "export", "--format", "jsonl").stdout.splitlines()
+    actions = [json.loads(line)["action"] for line in lines]
+    assert actions == ["key.create", "service.start", "jobs.list", "clouds.list", "keys.list"]
+    assert specimap(given, "audit", "verify").returncode == 0

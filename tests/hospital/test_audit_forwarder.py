@@ -44,9 +44,9 @@ def add(database: Database, count: int, **given: Any) -> None:
         session.add_all(AuditEntry(**values) for _ in range(count))
 
 
-@pytest.fixture(params=["tls", "tcp", "udp"])
+@pytest.fixture(params=["tls", "tls gtls", "tcp", "udp"])
 def server(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rsyslog]:
-    running = Rsyslog(tmp_path / "rsyslog", request.param)
+    running = Rsyslog(tmp_path / "rsyslog", *request.param.split())
     running.start()
     yield running
     running.stop()

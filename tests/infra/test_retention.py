@@ -6,6 +6,7 @@ import datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import sqlalchemy as sa
 
@@ -91,7 +92,7 @@ def test_rules_of_projects_win(tables: Database, store: Storage) -> None:
 
 def test_labelled_acquisitions_stay_unless_the_settings_say_otherwise(service: Running, tmp_path: Path) -> None:
     result = put_result(service, tmp_path / "result")
-    put_label(service, result, "tissue")
+    put_label(service, result, "tissue", np.zeros(result.cloud.n_points, np.uint8))
     age(service.database, result.acquisition_id)
     assert swept(service.database, service.storage, keep_acquisition_days=30) == 0
     assert swept(service.database, service.storage, keep_acquisition_days=30, keep_labelled=False) == 1

@@ -108,7 +108,9 @@ def test_a_warm_spectrum_asks_no_database(service: Running, result: Result, monk
     statements: list[str] = []
 
     def note(_: object, __: object, statement: str, *___: object) -> None:
-        statements.append(statement)
+        # The audit trail looks up the acquisition of what was read, in a thread of its own.
+        if threading.current_thread().name != "audit":
+            statements.append(statement)
 
     def read(index: int) -> None:
         reader.get(f"/v1/clouds/{result.cloud_id}/points/{index}").raise_for_status()

@@ -27,6 +27,7 @@ from tests.support.export_scene import address, make
 from tests.support.label_files import NPY, layer, npy
 from tests.support.planted import (
     MARK,
+    PLANTED,
     arrays_in,
     cube_values,
     envi_header,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import sqlalchemy as sa
 
 from specimap_infra.tables import StoredFile
@@ -15,16 +16,17 @@ from tests.support.service_scene import Running
 def test_a_hold_blocks_every_deletion_and_its_release_allows_it(service: Running, tmp_path: Path) -> None:
     owner = acquisition(service.database)
     result = put_result(service, tmp_path / "result", acquisition_id=owner)
-    put_label(service, result, "tissue")
+    put_label(service, result, "tissue", np.zeros(result.cloud.n_points, np.uint8))
     client, admin = service.client(["upload", "read", "label"]), service.client(["admin"])
     hold = f"/v1/acquisitions/{owner}/hold"
     assert client.put(hold, json={"reason": "lawsuit-7"}).status_code == 403
-    assert client.get(hold).status_code == 404
+    assert client.get(hold).status_code == 403
+    assert admin.get(hold).status_code == 404
     assert admin.put(hold, json={"reason": "A name, perhaps"}).status_code == 422
     made = admin.put(hold, json={"reason": "lawsuit-7"})
     assert (made.status_code, made.json()["reason"]) == (201, "lawsuit-7")
     assert admin.put(hold, json={"reason": "lawsuit-8"}).status_code == 200
-    assert client.get(hold).json()["reason"] == "lawsuit-8"
+    assert admin.get(hold).json()["reason"] == "lawsuit-8"
     with service.database.session() as session:
         file_id = session.scalars(sa.select(StoredFile.id).where(StoredFile.acquisition_id == owner)).first()
     deletions = {

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from specimap_core.cloud import Cloud
 from specimap_core.cloud.labels import GROUP_DOCUMENT
+from specimap_infra.audit.entries import name_digest
 from tests.support.label_files import ARROW, CLASSES, MODEL, NPY, header, layer, npy
 from tests.support.result_scene import Result, put_result
 from tests.support.service_scene import Running
@@ -209,11 +210,12 @@ def test_scopes_audit_and_deletion(service: Running, result: Result, values: NDA
     assert labeller.put(layer(result), content=npy(values), headers=header()).json()["version"] == 1
     np.testing.assert_array_equal(reader.get(layer(result) + "/values").json()["values"], values)
     audited = admin.get("/v1/audit", params={"target": result.cloud_id}).json()["items"]
+    digest = name_digest(result.cloud_id, "tissue")
     assert [(entry["action"], entry["details"]) for entry in audited] == [
-        ("label.put", {"layer": "tissue", "version": 1}),
-        ("label.delete", {"layer": "tissue", "versions": 2}),
-        ("label.put", {"layer": "tissue", "version": 2}),
-        ("label.put", {"layer": "tissue", "version": 1}),
+        ("label.put", {"layer": digest, "version": 1}),
+        ("label.delete", {"layer": digest, "versions": 2}),
+        ("label.put", {"layer": digest, "version": 2}),
+        ("label.put", {"layer": digest, "version": 1}),
     ]
     assert {entry["key_id"] for entry in audited} == {label["created_by"]}
 

@@ -14,7 +14,7 @@ import sqlalchemy as sa
 from specimap_infra import jobs
 from specimap_infra.database import utc_now
 from specimap_infra.ids import new_id
-from specimap_infra.tables import Delivery, StoredFile
+from specimap_infra.tables import Delivery, Erasure, StoredFile
 from specimap_service.contract.description import operations
 from tests.support.access_scene import JUDGEMENT
 from tests.support.documented import contract
@@ -59,6 +59,10 @@ def full_lists(service: Running, client: httpx.Client, folder: Path) -> dict[str
     with service.database.session() as session:
         jobs.request_cancel(session, notified)
         session.add_all(Delivery(id=new_id("dlv"), job_id=notified, state="given_up") for _ in range(3))
+        session.add_all(
+            Erasure(id=new_id("ers"), specimen_hash="0", acquisitions=[], removal={}, state="done", created_by="k")
+            for _ in range(3)
+        )
     return {
         "deliveries.list": f"/v1/jobs/{notified}/deliveries",
         "projects.list": "/v1/projects",
@@ -73,6 +77,7 @@ def full_lists(service: Running, client: httpx.Client, folder: Path) -> dict[str
         "labels.list_versions": f"{cloud}/labels/a/versions",
         "exports.list": f"{cloud}/exports",
         "shares.list": f"{cloud}/shares",
+        "erasures.list": "/v1/erasures",
     }
 
 

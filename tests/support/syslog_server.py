@@ -60,10 +60,11 @@ def _free_port(kind: socket.SocketKind) -> int:
 
 @dataclass
 class Rsyslog:
-    """A server that can be stopped and started again. ``kind``: tls, tcp or udp."""
+    """A server that can be stopped and started again. ``kind``: tls, tcp or udp; ``driver``: ossl or gtls."""
 
     folder: Path
     kind: str
+    driver: str = "ossl"
     port: int = 0
     process: subprocess.Popen[bytes] | None = field(default=None, repr=False)
 
@@ -95,7 +96,7 @@ class Rsyslog:
         if self.kind == "udp":
             receives = f'module(load="imudp")\ninput(type="imudp" address="127.0.0.1" port="{self.port}" ruleset="r")'
         else:
-            tls = 'StreamDriver.Name="ossl" StreamDriver.Mode="1" StreamDriver.AuthMode="anon"'
+            tls = f'StreamDriver.Name="{self.driver}" StreamDriver.Mode="1" StreamDriver.AuthMode="anon"'
             receives = (
                 f'module(load="imtcp" {tls if self.kind == "tls" else ""})\n'
                 f'input(type="imtcp" address="127.0.0.1" port="{self.port}" ruleset="r")'

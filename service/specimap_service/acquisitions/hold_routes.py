@@ -12,7 +12,7 @@ from specimap_core.errors import NotFoundError
 from specimap_infra.database import utc_now
 from specimap_infra.tables import LegalHold
 from specimap_service.acquisitions.capacity import locked_acquisition
-from specimap_service.auth.dependencies import Admin, Reader
+from specimap_service.auth.dependencies import Admin
 from specimap_service.auth.object_ids import AcquisitionId
 from specimap_service.context import Context, audit
 
@@ -59,7 +59,7 @@ def put_hold(
 
 
 @router.get("", operation_id="holds.get")
-def get_hold(context: Context, principal: Reader, acquisition_id: AcquisitionId) -> Hold:
+def get_hold(context: Context, principal: Admin, acquisition_id: AcquisitionId) -> Hold:
     """Return the hold of an acquisition."""
     with context.database.session() as session:
         row = session.get(LegalHold, acquisition_id)
