@@ -12,6 +12,7 @@ import typer
 
 from specimap_cli import run_options
 from specimap_cli.backup import backup, restore
+from specimap_cli.dicom import dicom
 from specimap_cli.doctor import doctor
 from specimap_cli.errors import Debug, reported_errors, stoppable
 from specimap_cli.keys import keys_app
@@ -215,6 +216,7 @@ def _root(
 
 
 app.command()(report)
+app.command()(dicom)
 app.command()(validate)
 app.command()(phantom)
 app.command()(doctor)
