@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, BrowserType, Page, expect, sync_playwright
 
 from bench.chromium import ARGUMENTS, chromium
 from tests.support.places import ROOT, SAMPLES
@@ -78,13 +78,19 @@ def write_camera(path: Path) -> None:
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     """A headless browser, for a module: while one runs, the process has an event loop that other modules lack."""
-    path, camera = browser_path(), tmp_path_factory.mktemp("camera") / "camera.mjpeg"
+    camera = tmp_path_factory.mktemp("camera") / "camera.mjpeg"
+    browser_path()
     write_camera(camera)
-    fake = ("--use-fake-device-for-media-stream", f"--use-file-for-fake-video-capture={camera}")
     with sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=path, args=[*ARGUMENTS, *OWN_ARGUMENTS, *fake])
+        started = launch(playwright.chromium, camera)
         yield started
         started.close()
+
+
+def launch(chromium: BrowserType, camera: Path) -> Browser:
+    """Start a browser whose camera shows a Motion JPEG file again and again."""
+    fake = ("--use-fake-device-for-media-stream", f"--use-file-for-fake-video-capture={camera}")
+    return chromium.launch(executable_path=browser_path(), args=[*ARGUMENTS, *OWN_ARGUMENTS, *fake])
 
 
 @pytest.fixture

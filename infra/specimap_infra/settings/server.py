@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pydantic import BaseModel, Field
 
+from specimap_infra.settings.units import GIB
+
 
 class ServerSettings(BaseModel):
     """The API and its connections."""
@@ -32,6 +34,11 @@ class ServerSettings(BaseModel):
     )
     max_streams_per_key: int = Field(
         default=100, ge=1, description="Streams of job events that one key may follow at a time, in each API process."
+    )
+    band_copies_bytes: int = Field(
+        default=8 * GIB,
+        ge=0,
+        description="Most bytes of the copies in the scratch folder from which single bands of large results are read quickly; 0 makes none.",
     )
     head_seconds: float = Field(default=30, gt=0, description="Longest time that the head of a request may take.")
     keep_alive_seconds: float = Field(

@@ -58,8 +58,8 @@ def draw(settings: ServiceSettings, drawing: Drawing) -> Picture:
         RequestInvalidError, NotFoundError: there is no such band.
         CloudDamagedError, StorageUnavailableError: the cloud cannot be read.
     """
-    _settle()
-    canvas = _opened(settings, drawing.prefix)
+    settle()
+    canvas = opened(settings, drawing.prefix)
     try:
         return pictures.draw(canvas.cloud, drawing.paint(canvas), drawing.grid, drawing.size)
     except CloudDamagedError:
@@ -122,13 +122,13 @@ _STORAGES: dict[str, Storage] = {}
 
 
 @cache
-def _settle() -> None:
+def settle() -> None:
     """Give way to the processes that answer requests, and leave the terminal's interrupt to them."""
     step_back()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _opened(settings: ServiceSettings, prefix: str) -> Canvas:
+def opened(settings: ServiceSettings, prefix: str) -> Canvas:
     place = settings.storage_place
     found = _OPENED.pop((place, prefix), None)
     if found is None:

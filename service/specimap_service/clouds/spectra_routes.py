@@ -29,7 +29,8 @@ from specimap_service.auth.dependencies import Reader
 from specimap_service.auth.object_ids import CloudId
 from specimap_service.body_limits import parsed
 from specimap_service.byte_ranges import CACHED, VARY, known_to_client
-from specimap_service.clouds.dependencies import CloudsDep, ReadingDep
+from specimap_service.clouds.band_copies import BandCopies
+from specimap_service.clouds.dependencies import BandCopiesDep, CloudsDep, ReadingDep
 from specimap_service.clouds.open_clouds import CloudRecord, OpenClouds
 from specimap_service.clouds.spectra import (
     MOST_JSON_VALUES,
@@ -182,14 +183,20 @@ def _page_points(limit: int | None, width: int, *, json: bool) -> int:
     operation_id="spectra.get_band",
 )
 async def read_band(
-    principal: Reader, clouds: CloudsDep, reading: ReadingDep, request: Request, cloud_id: CloudId, band: Number
+    principal: Reader,
+    clouds: CloudsDep,
+    copies: BandCopiesDep,
+    reading: ReadingDep,
+    request: Request,
+    cloud_id: CloudId,
+    band: Number,
 ) -> Response:
     """Return one band of all points, in their order. Arrow: column `value`; NumPy: float32 (points,)."""
     key = principal.key_id
-    return await reading.run(key, _band, clouds, cloud_id, band, request, reading.pace(key))
+    return await reading.run(key, _band, clouds, copies, cloud_id, band, request, reading.pace(key))
 
 
-def _band(clouds: OpenClouds, cloud_id: str, band: int, request: Request, pace: Pace) -> Response:
+def _band(clouds: OpenClouds, copies: BandCopies, cloud_id: str, band: int, request: Request, pace: Pace) -> Response:
     media = chosen_type(request)
     with clouds.reading(cloud_id) as (record, cloud):
         if band >= cloud.bands:
@@ -202,7 +209,8 @@ def _band(clouds: OpenClouds, cloud_id: str, band: int, request: Request, pace: 
         headers = {"ETag": etag, "Cache-Control": CACHED, "Vary": f"Accept, {VARY}"}
         if known_to_client(request, etag):
             return Response(status_code=304, headers=headers)
-        values = cloud.band(band)
+        stored = copies.band(record, band)
+        values = cloud.band(band) if stored is None else cloud.decode(stored)
         described = _described(cloud, np.array([band]))
         if media == NPY:
             return npy_answer((len(values),), lambda a, b: values[a:b], headers, pace)

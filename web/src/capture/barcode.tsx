@@ -1,25 +1,16 @@
-/** Read a specimen's id from a barcode with the camera, where the browser can: Chrome on Android does, Safari does not. */
+/** Read a specimen's id from a barcode with the camera. */
 import { useEffect, useRef, useState } from "preact/hooks";
+import { barcodeDetector, type Detector } from "./barcode-detector";
 import { CameraTrouble, closeCamera, openCamera } from "./photos/camera";
 import { isSpecimenId } from "./specimen-id";
 import { t } from "./texts";
 
-interface Detector {
-  detect(source: HTMLVideoElement): Promise<{ rawValue: string }[]>;
-}
-type DetectorClass = new () => Detector;
-
 /** Milliseconds between looks at the picture. */
 const PAUSE = 250;
-
-function detectorClass(): DetectorClass | null {
-  return (globalThis as { BarcodeDetector?: DetectorClass }).BarcodeDetector ?? null;
-}
 
 export function Barcode({ found }: { found: (text: string) => void }) {
   const [open, setOpen] = useState(false);
   const [said, setSaid] = useState("");
-  if (detectorClass() === null) return <p class="small">{t("scanNone")}</p>;
   const read = (text: string): void => {
     if (isSpecimenId(text)) {
       setOpen(false);
@@ -50,18 +41,15 @@ function Scanner({ read, failed }: { read: (text: string) => void; failed: (text
   const told = useRef({ read, failed });
   told.current = { read, failed };
   useEffect(() => {
-    const Class = detectorClass();
-    if (Class === null) return;
     let stream: MediaStream | null = null;
     let timer: ReturnType<typeof setTimeout> | undefined;
     let ended = false;
-    const detector = new Class();
-    const look = async (): Promise<void> => {
+    const look = async (detector: Detector): Promise<void> => {
       const shown = video.current;
       if (ended || !shown) return;
       const codes = shown.readyState >= 2 ? await detector.detect(shown).catch(() => []) : [];
       if (codes[0]) told.current.read(codes[0].rawValue.trim());
-      timer = setTimeout(() => void look(), PAUSE);
+      timer = setTimeout(() => void look(detector), PAUSE);
     };
     openCamera().then(
       async (opened) => {
@@ -72,7 +60,9 @@ function Scanner({ read, failed }: { read: (text: string) => void; failed: (text
         }
         video.current.srcObject = opened;
         await video.current.play().catch(() => undefined);
-        await look();
+        const detector = await barcodeDetector().catch(() => null);
+        if (detector) await look(detector);
+        else told.current.failed(t("scanFailed"));
       },
       (thrown: unknown) => {
         const trouble = thrown instanceof CameraTrouble ? thrown : new CameraTrouble("cameraFailed");

@@ -142,8 +142,10 @@ export class ViewerModel {
     if (this.loader.state.peek() !== "ready") return;
     this.ahead = setTimeout(() => {
       const { mode, band } = this.state.peek();
-      if (!this.bands.sampleNow) void this.bands.sample().catch(noted);
-      else if (mode === "band" && !this.bands.busy) void this.bands.exact(Math.min(band + 1, this.info.bands - 1)).catch(noted);
+      if (!this.bands.sampleNow) {
+        // The first band that is read has the service prepare the others.
+        void this.bands.sample().then(() => this.bands.exact(band)).catch(noted);
+      } else if (mode === "band" && !this.bands.busy) void this.bands.exact(Math.min(band + 1, this.info.bands - 1)).catch(noted);
     }, AHEAD_MS);
   }
 
