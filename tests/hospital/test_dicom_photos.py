@@ -41,7 +41,7 @@ def shown(dataset: Dataset) -> NDArray[np.uint8]:
 
 
 def apart(picture: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
-    """Mean difference of two pictures (H, W, 3) in blocks of 8 x 8 pixels: coded anew, colours lose their detail alone."""
+    """Mean difference of two pictures (H, W, 3) in blocks of 8 x 8 pixels: coding blurs the colours of finer detail."""
     small = [
         np.asarray(Image.fromarray(p).resize((p.shape[1] // 8, p.shape[0] // 8), Image.Resampling.BOX), float)
         for p in (picture, other)
