@@ -99,9 +99,12 @@ class Header:
         dataset.InstanceNumber = number
         dataset.InstanceCreationDate, dataset.InstanceCreationTime = da(self.source.created), tm(self.source.created)
         dataset.ContentDate, dataset.ContentTime = da(self.source.created), tm(self.source.created)
-        # The library that made it names itself, with the time of day: a second build would be another object.
+        # What the library takes from the clock and from chance would make a second build another object.
         for equipment in dataset.get("ContributingEquipmentSequence", []):
             equipment.ContributionDateTime = da(self.source.created) + tm(self.source.created)
+        for name in ("DimensionOrganizationSequence", "DimensionIndexSequence"):
+            for dimension in dataset.get(name, []):
+                dimension.DimensionOrganizationUID = derived_uid("dimensions", dataset.SOPInstanceUID)
 
     def image(self, series: Series, sop_class: str, role: str, number: int) -> Dataset:
         """A new image with the shared modules and the specimen."""
