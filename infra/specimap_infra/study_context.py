@@ -24,12 +24,12 @@ class StudyContext(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    study_instance_uid: Uid | None = Field(None, description="The order's own study; without it one is made.")
+    study_instance_uid: Uid | None = Field(default=None, description="The order's own study; without it one is made.")
     accession_number: ShortText = ""
     issuer_of_accession_number: Text = ""
     patient_id: Text = ""
     issuer_of_patient_id: Text = ""
-    patient_name: Text = Field("", description="`Family^Given^Middle^Prefix^Suffix`.")
+    patient_name: Text = Field(default="", description="`Family^Given^Middle^Prefix^Suffix`.")
     patient_birth_date: datetime.date | None = None
     patient_sex: Literal["", "M", "F", "O"] = ""
     referring_physician_name: Text = ""
@@ -39,9 +39,9 @@ class StudyContext(BaseModel):
     study_time: datetime.time | None = None
     requested_procedure_id: ShortText = ""
     scheduled_procedure_step_id: ShortText = ""
-    container_identifier: Text = Field("", description="Of the container of the specimen; by default its id.")
+    container_identifier: Text = Field(default="", description="Of the container of the specimen; by default its id.")
     issuer_of_container_identifier: Text = ""
-    specimen_identifier: Text = Field("", description="By default the specimen's id of the acquisition.")
+    specimen_identifier: Text = Field(default="", description="By default the specimen's id of the acquisition.")
     issuer_of_specimen_identifier: Text = ""
     specimen_uid: Uid | None = None
     specimen_description: Text = ""

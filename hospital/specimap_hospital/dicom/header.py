@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pydicom import Dataset
 from pydicom.dataset import FileMetaDataset
 from pydicom.sequence import Sequence
+from pydicom.uid import UID
 
 from specimap_hospital.dicom.codes import SPECIMEN_CONTAINER
 from specimap_hospital.dicom.model import ResultSource
@@ -141,8 +142,8 @@ class Header:
         meta = FileMetaDataset()
         meta.MediaStorageSOPClassUID = dataset.SOPClassUID
         meta.MediaStorageSOPInstanceUID = dataset.SOPInstanceUID
-        meta.TransferSyntaxUID = transfer_syntax
-        meta.ImplementationClassUID = IMPLEMENTATION_CLASS_UID
+        meta.TransferSyntaxUID = UID(transfer_syntax)
+        meta.ImplementationClassUID = UID(IMPLEMENTATION_CLASS_UID)
         meta.ImplementationVersionName = (
             "SPECIMAP_" + re.sub(r"[^0-9A-Z]+", "_", self.source.software_version.upper())[:7]
         )
