@@ -26,6 +26,7 @@ pytest_plugins = (
     "tests.support.webhook_receiver",
     "tests.support.browser_scene",
     "tests.support.orthanc",
+    "tests.support.dicom_scene",
 )
 
 TEST_DATA_VARIABLE = "SPECIMAP_TEST_DATA"

@@ -231,7 +231,7 @@ def test_lock_pins_what_the_project_asks_for() -> None:
         *project["dependencies"],
         *(
             requirement
-            for extra in ("infra", "screening", "service", "pipeline", "dev")
+            for extra in ("infra", "screening", "documents", "hospital", "service", "pipeline", "dev")
             for requirement in project["optional-dependencies"][extra]
         ),
     ]

@@ -14,6 +14,7 @@ from specimap_cli import run_options
 from specimap_cli.audit import audit_app
 from specimap_cli.backup import backup, restore
 from specimap_cli.contexts import contexts_app
+from specimap_cli.dicom import dicom
 from specimap_cli.doctor import doctor
 from specimap_cli.erasure import erase, verify_certificate
 from specimap_cli.errors import Debug, reported_errors, stoppable
@@ -228,6 +229,7 @@ def _root(
 
 
 app.command()(report)
+app.command()(dicom)
 app.command()(validate)
 app.command()(phantom)
 app.command()(doctor)

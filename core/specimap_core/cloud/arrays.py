@@ -178,7 +178,8 @@ class CloudArrays:
     def label(self, name: str) -> Array:
         """Values (S, ...) of a label. Raises NotFoundError, CloudDamagedError."""
         if name not in self.label_names:
-            raise NotFoundError(f"The cloud has no label {name!r}.", advice="", labels=self.label_names)
+            known = ", ".join(self.label_names) or "none"
+            raise NotFoundError(f"The cloud has no label {name!r}.", advice=f"It has {known}.", labels=self.label_names)
         with damage(self.source, f"labels/{name}"):
             return np.asarray(zarr.open_array(self.path / "labels" / name, mode="r")[...])
 

@@ -53,6 +53,11 @@ def build(request: Mapping[str, Any], say: Any) -> list[DicomObject]:
     return objects
 
 
+def _out_of_memory(error: Exception, limit: int) -> bool:
+    """Whether it is the limit that stopped the process: libraries that do not fit fail to be loaded."""
+    return isinstance(error, MemoryError) or bool(limit and isinstance(error, ImportError | OSError))
+
+
 def main(arguments: list[str]) -> int:
     """Answer one request. Arguments: the parent's process id, most bytes of memory (0: no limit)."""
     limit_blas_threads()
@@ -72,15 +77,13 @@ def main(arguments: list[str]) -> int:
         say({"objects": [made.as_dict() for made in build(request, say)]})
     except SpecimapError as error:
         say({"error": error.as_dict()})
-    except MemoryError:
-        say(
-            {
-                "error": MemoryExhaustedError(
-                    "The DICOM objects need more memory than they may take.", advice="Allow the process more memory."
-                ).as_dict()
-            }
-        )
     except Exception as error:
+        if _out_of_memory(error, int(memory)):
+            refused = MemoryExhaustedError(
+                "The DICOM objects need more memory than they may take.", advice="Allow the process more memory."
+            )
+            say({"error": refused.as_dict()})
+            return 0
         # No text of the error, which may hold a value of the study context; and the trace without values goes to the
         # log of whoever started this.
         traceback.print_tb(error.__traceback__)

@@ -7,9 +7,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from highdicom.sr import CodedConcept
 
 from specimap_core.report.model import Report
-from specimap_hospital.dicom.codes import MICROMETRE, MILLIMETRE, NO_UNIT, PERCENT, PIXELS, CodedConcept, own
+from specimap_hospital.dicom.codes import MICROMETRE, MILLIMETRE, NO_UNIT, PERCENT, PIXELS, own
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pydicom import Dataset
 from pydicom.dataset import FileMetaDataset
 from pydicom.sequence import Sequence
+from pydicom.uid import UID
 
 from specimap_hospital.dicom.codes import SPECIMEN_CONTAINER
 from specimap_hospital.dicom.model import ResultSource
@@ -99,6 +100,12 @@ class Header:
         dataset.InstanceNumber = number
         dataset.InstanceCreationDate, dataset.InstanceCreationTime = da(self.source.created), tm(self.source.created)
         dataset.ContentDate, dataset.ContentTime = da(self.source.created), tm(self.source.created)
+        # What the library takes from the clock and from chance would make a second build another object.
+        for equipment in dataset.get("ContributingEquipmentSequence", []):
+            equipment.ContributionDateTime = da(self.source.created) + tm(self.source.created)
+        for name in ("DimensionOrganizationSequence", "DimensionIndexSequence"):
+            for dimension in dataset.get(name, []):
+                dimension.DimensionOrganizationUID = derived_uid("dimensions", dataset.SOPInstanceUID)
 
     def image(self, series: Series, sop_class: str, role: str, number: int) -> Dataset:
         """A new image with the shared modules and the specimen."""
@@ -135,8 +142,8 @@ class Header:
         meta = FileMetaDataset()
         meta.MediaStorageSOPClassUID = dataset.SOPClassUID
         meta.MediaStorageSOPInstanceUID = dataset.SOPInstanceUID
-        meta.TransferSyntaxUID = transfer_syntax
-        meta.ImplementationClassUID = IMPLEMENTATION_CLASS_UID
+        meta.TransferSyntaxUID = UID(transfer_syntax)
+        meta.ImplementationClassUID = UID(IMPLEMENTATION_CLASS_UID)
         meta.ImplementationVersionName = (
             "SPECIMAP_" + re.sub(r"[^0-9A-Z]+", "_", self.source.software_version.upper())[:7]
         )

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import highdicom as hd
 import numpy as np
+from highdicom.sr import CodedConcept
 from pydicom import Dataset
 from pydicom.uid import ExplicitVRLittleEndian
 
@@ -14,7 +15,7 @@ from specimap_core.arrays import Array, Singles
 from specimap_core.cloud import Cloud
 from specimap_core.errors import NotFoundError, SettingsError
 from specimap_hospital.dicom import codes
-from specimap_hospital.dicom.codes import CodedConcept, own
+from specimap_hospital.dicom.codes import own
 from specimap_hospital.dicom.files import Written, write_dataset
 from specimap_hospital.dicom.header import MANUFACTURER, NO_SERIAL_NUMBER, RESEARCH, Header, Series
 from specimap_hospital.dicom.model import BandChoice
