@@ -13,7 +13,7 @@ import typer
 from specimap_cli import run_options
 from specimap_cli.backup import backup, restore
 from specimap_cli.doctor import doctor
-from specimap_cli.errors import Debug, reported_errors, stoppable
+from specimap_cli.errors import FAILED, Debug, reported_errors, stoppable
 from specimap_cli.keys import keys_app
 from specimap_cli.phantom import phantom
 from specimap_cli.progress import Listener, json_listener, progress_listener
@@ -171,13 +171,24 @@ def serve(
 def worker(
     slots: Annotated[int | None, typer.Option(min=1, max=64, help="Jobs side by side.")] = None,
     kind: Annotated[Kind, typer.Option(help="What the slots are.")] = Kind.cpu,
+    health: Annotated[
+        bool, typer.Option("--health", help="Start nothing: say whether the workers of this machine are alive.")
+    ] = False,
     debug: Debug = False,
 ) -> None:
     """Start workers for a service that runs elsewhere, on the same database and storage."""
+    sound = True
     with reported_errors(progress_listener(), debug):
-        from specimap_cli.serve import work
+        if health:
+            from specimap_cli.worker_health import say_health
 
-        work(slots=slots, kind=kind.value)
+            sound = say_health(typer.echo)
+        else:
+            from specimap_cli.serve import work
+
+            work(slots=slots, kind=kind.value)
+    if not sound:
+        raise typer.Exit(FAILED)
 
 
 @app.command()
