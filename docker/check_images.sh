@@ -110,6 +110,10 @@ if holds:
     holds = tables and database.execute("SELECT count(*) FROM leases").fetchone()[0] == 1
     database.close()
 END
+    starts_and_ends "$1" <<'END'
+import subprocess
+holds = subprocess.run(health[1:], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL).returncode == 0
+END
     cp -r samples "$("${tool[@]}" mount "$1")/samples"
     in_image "$1" specimap run --photos /samples/rgb --cube /samples/hsi/hsi.hdr --out /tmp/out --json | python3 -c '
 import json, sys
