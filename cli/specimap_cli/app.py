@@ -15,6 +15,7 @@ from specimap_cli.backup import backup, restore
 from specimap_cli.doctor import doctor
 from specimap_cli.errors import FAILED, Debug, reported_errors, stoppable
 from specimap_cli.keys import keys_app
+from specimap_cli.migrate import migrate
 from specimap_cli.phantom import phantom
 from specimap_cli.progress import Listener, json_listener, progress_listener
 from specimap_cli.projects import projects_app
@@ -229,6 +230,7 @@ app.command()(report)
 app.command()(validate)
 app.command()(phantom)
 app.command()(doctor)
+app.command()(migrate)
 app.command()(backup)
 app.command()(restore)
 app.add_typer(study_app, name="study")
