@@ -88,7 +88,7 @@ class LeaseKeeper:
                     self._look_after(None)
                     continue
                 living = self._living()
-                if random.random() * len(living) > LOOKING:
+                if random.random() * len(living) > LOOKING:  # noqa: S311 - spreads work, keeps no secret
                     continue
                 self._look_after(living)
                 if now - settled >= self._ttl:
