@@ -101,6 +101,7 @@ lint: setup
 	$(RUN)/ruff format --check .
 	$(RUN)/ruff check .
 	$(RUN)/mypy
+	$(RUN)/mypy docker/sbom.py docker/audit_dependencies.py
 
 bench: setup
 	$(RUN)/python -m bench
@@ -114,6 +115,12 @@ wheel: setup
 
 check-images:
 	docker/check_images.sh
+
+sbom: setup
+	$(RUN)/python docker/sbom.py release
+
+audit-dependencies: setup
+	$(RUN)/python docker/audit_dependencies.py
 
 check-install: wheel
 	docker/check_install.sh out/dist/specimap-*.whl
