@@ -33,11 +33,7 @@ def rows(database: Database) -> dict[str, list[dict[str, Any]]]:
         metadata = sa.MetaData()
         metadata.reflect(connection)
         for name, table in metadata.tables.items():
-            if (
-                name != "alembic_version"
-                and "projects" in metadata.tables
-                and not name.startswith(("workflow", "dbos"))
-            ):
+            if name in Base.metadata.tables:
                 found[name] = [dict(row) for row in connection.execute(sa.select(table)).mappings()]
     return found
 
