@@ -24,7 +24,7 @@ OPERATOR = {
     "rate_limited": "Nothing, or give this key a higher limit (`POST /v1/keys`, `rate_per_minute`).",
     "request_timeout": "Look at the network between client and proxy; `SPECIMAP_SILENCE_SECONDS` sets the wait.",
     "restore_target_not_empty": "Restore into a new data folder, or an empty database and bucket.",
-    "setting_invalid": "At a start: correct what it names ([settings.md](settings.md)). In a job: the sender's to correct.",
+    "setting_invalid": "At a start: correct what it names ([settings.md](settings.md)). In a job: its sender.",
     "stage_failed": "Keep the job, and report it with its log: a library failed on an input that no check caught.",
     "stage_timeout": "See whether the machine is overloaded; else raise `SPECIMAP_STAGE_SECONDS`.",
     "storage_full": "Free space or enlarge the disk; `SPECIMAP_KEEP_...` removes artefacts and exports earlier.",
