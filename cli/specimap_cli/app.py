@@ -34,6 +34,8 @@ app = typer.Typer(
     help="Photos and one hyperspectral cube of an excised specimen to a metric 3D point cloud with spectra.",
 )
 
+RESEARCH_ONLY = "For research use only. Not a medical device."
+
 
 class Format(StrEnum):
     """Export formats."""
@@ -215,7 +217,7 @@ def demo(
 
 def _version(asked: bool) -> None:
     if asked:
-        typer.echo(f"specimap {__version__}")
+        typer.echo(f"specimap {__version__}\n{RESEARCH_ONLY}")
         raise typer.Exit
 
 

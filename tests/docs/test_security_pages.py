@@ -80,6 +80,7 @@ def test_the_disclosure_has_every_section_of_the_form() -> None:
 @pytest.mark.parametrize(
     "page",
     [
+        ROOT / "README.md",
         ROOT / "SECURITY.md",
         DOCS / "operations.md",
         DOCS / "README.md",
