@@ -34,11 +34,12 @@ rm -rf "$root/release"
 mkdir "$root/release"
 cp -r "$wheel" requirements.lock docker/systemd samples "$root/release/"
 
-# inside COMMAND...: run it in the new system, with nothing of this one's environment.
-inside() {
-    env -i PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin LANG=C.UTF-8 DEBIAN_FRONTEND=noninteractive \
-        PIP_ROOT_USER_ACTION=ignore chroot "$root" "$@"
-}
+# In the new system, with nothing of this one's environment.
+inside=(env -i PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin LANG=C.UTF-8 DEBIAN_FRONTEND=noninteractive
+    PIP_ROOT_USER_ACTION=ignore chroot "$root")
+# As the units run it, but for what only systemd can do.
+as_unit=("${inside[@]}" setpriv --reuid specimap --regid specimap --clear-groups --no-new-privs --bounding-set=-all
+    env SPECIMAP_DATA_DIR=/var/lib/specimap SPECIMAP_PORT="${CHECK_PORT:-18766}" sh -c 'umask 0077; exec $0')
 
 # lines MARK: the commands between the marks of the page.
 lines() {
@@ -47,27 +48,21 @@ lines() {
 
 echo "== the lines of docs/hospital-it.md"
 start=$SECONDS
-inside sh -euxc "cd /release; $(lines install)" >"$work/install.log" 2>&1 || { tail -n 30 "$work/install.log" >&2; exit 1; }
+"${inside[@]}" sh -euxc "cd /release; $(lines install)" >"$work/install.log" 2>&1 || { tail -n 30 "$work/install.log" >&2; exit 1; }
 echo "installed in $((SECONDS - start)) s: $(du -sh "$root/opt/specimap" | cut -f1)"
-key=$(inside sh -euc "$(lines start)" | grep '^spk_')
+key=$("${inside[@]}" sh -euc "$(lines start)" | grep '^spk_')
 
 # unit NAME: the command of a unit, with %i as 1.
 unit() {
     sed -n 's/^ExecStart=//p' "$root/etc/systemd/system/$1" | sed 's/%i/1/'
 }
 
-# as_unit COMMAND: run it as the units do, but for what only systemd can do.
-as_unit() {
-    inside setpriv --reuid specimap --regid specimap --clear-groups --no-new-privs --bounding-set=-all \
-        env SPECIMAP_DATA_DIR=/var/lib/specimap SPECIMAP_PORT="${CHECK_PORT:-18766}" sh -c "umask 0077; exec $1"
-}
-
 echo "== the service"
-as_unit "$(unit specimap.service)" >"$work/service.log" 2>&1 &
+"${as_unit[@]}" "$(unit specimap.service)" >"$work/service.log" 2>&1 &
 service=$!
-as_unit "$(unit specimap-worker@.service)" >"$work/worker.log" 2>&1 &
+"${as_unit[@]}" "$(unit specimap-worker@.service)" >"$work/worker.log" 2>&1 &
 worker=$!
-inside /opt/specimap/.venv/bin/python - "$key" "${CHECK_PORT:-18766}" <<'END' || { cat "$work"/service.log "$work"/worker.log >&2; exit 1; }
+"${inside[@]}" /opt/specimap/.venv/bin/python - "$key" "${CHECK_PORT:-18766}" <<'END' || { cat "$work"/service.log "$work"/worker.log >&2; exit 1; }
 import json, sys, time, urllib.error, urllib.request
 key, port = sys.argv[1:]
 
@@ -89,13 +84,12 @@ assert [each["name"] for each in json.loads(ask("/v1/keys"))] == ["administrator
 assert b"<html" in ask("/").lower()
 print(f"ready after {time.monotonic() - start:.1f} s, pages and key included")
 END
-as_unit "/opt/specimap/.venv/bin/specimap worker --health"
-[ "$(stat -c '%U %a' "$root/var/lib/specimap" 2>/dev/null)" != "root 755" ]
-[ "$(inside stat -c '%U %a' /var/lib/specimap/specimap.db)" = "specimap 600" ] || { echo "the database is open to others" >&2; exit 1; }
+"${as_unit[@]}" "/opt/specimap/.venv/bin/specimap worker --health"
+[ "$("${inside[@]}" stat -c '%U %a' /var/lib/specimap/specimap.db)" = "specimap 600" ] || { echo "the database is open to others" >&2; exit 1; }
 kill -TERM $service $worker
 wait $service && wait $worker || { echo "did not end in order" >&2; cat "$work"/service.log "$work"/worker.log >&2; exit 1; }
 
 echo "== the sample"
-inside /opt/specimap/.venv/bin/specimap run --photos /release/samples/rgb --cube /release/samples/hsi/hsi.hdr --out /tmp/out --json | tail -n 1 |
+"${inside[@]}" /opt/specimap/.venv/bin/specimap run --photos /release/samples/rgb --cube /release/samples/hsi/hsi.hdr --out /tmp/out --json | tail -n 1 |
     python3 -c 'import json, sys; print(json.loads(sys.stdin.read())["report"]["coverage"]["points"], "points")'
 echo "== all checked"

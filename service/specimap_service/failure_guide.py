@@ -27,7 +27,7 @@ OPERATOR = {
     "setting_invalid": "At a start: correct what it names ([settings.md](settings.md)). In a job: its sender.",
     "stage_failed": "Keep the job, and report it with its log: a library failed on an input that no check caught.",
     "stage_timeout": "See whether the machine is overloaded; else raise `SPECIMAP_STAGE_SECONDS`.",
-    "storage_full": "Free space or enlarge the disk; `SPECIMAP_KEEP_...` removes artefacts and exports earlier.",
+    "storage_full": "Free space or enlarge the disk; `SPECIMAP_KEEP_ARTEFACT_DAYS` frees some.",
     "storage_unavailable": "See that store and network work, and that the key may read and write the bucket.",
     "too_many_connections": "Raise `SPECIMAP_MAX_CONNECTIONS` and `LimitNOFILE`; limit single clients in the proxy.",
     "unauthorized": "Many of them: an expired key in a device, or somebody who guesses. `keys list` shows last use.",
