@@ -4,7 +4,7 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup identity-provider pages learned path-traced demo test test-pages test-fast lint bench bench-service check-images clean
+.PHONY: help setup identity-provider pages learned path-traced demo test test-pages test-fast lint bench bench-service wheel sbom audit-dependencies check-images check-install clean
 
 PYTHON ?= python3
 VENV := .venv
@@ -33,6 +33,10 @@ help:
 	@echo "make bench   measure time, memory and accuracy of a run"
 	@echo "make bench-service   measure the service beside nginx and PostgreSQL where they are, and kill its processes"
 	@echo "make check-images    build and run the images of docker/ without Docker (needs root and the network)"
+	@echo "make check-install   install a release in a bare Debian as docs/hospital-it.md says (needs root and the network)"
+	@echo "make wheel   the wheel of a release, with the web pages, into out/dist"
+	@echo "make sbom    lists of all packages of a release and its images (CycloneDX) into out/sbom"
+	@echo "make audit-dependencies   ask whether a package has a known weakness (needs the network; 3: nobody could be asked)"
 	@echo "make clean   remove $(VENV), web/node_modules, the built pages and out/"
 
 setup: $(STAMP) pages
@@ -105,6 +109,7 @@ lint: setup
 	$(RUN)/ruff format --check .
 	$(RUN)/ruff check .
 	$(RUN)/mypy
+	$(RUN)/mypy docker/sbom.py docker/audit_dependencies.py
 
 bench: setup
 	$(RUN)/python -m bench
@@ -113,8 +118,20 @@ bench-service: setup
 	$(RUN)/python -m bench.service
 	$(RUN)/python -m bench.faults --jobs 8 --minutes 10
 
+wheel: setup
+	$(RUN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --no-build-isolation --wheel-dir out/dist .
+
 check-images:
 	docker/check_images.sh
+
+sbom: setup
+	$(RUN)/python docker/sbom.py release
+
+audit-dependencies: setup
+	$(RUN)/python docker/audit_dependencies.py
+
+check-install: wheel
+	docker/check_install.sh out/dist/specimap-*.whl
 
 clean:
 	rm -rf $(VENV) .venv-canaille out web/node_modules service/specimap_service/pages

@@ -102,13 +102,14 @@ check_worker() {
 import cv2, embreex, open3d, pycolmap, scipy, tensorstore, specimap_workers.worker
 print("COLMAP", pycolmap.__version__)'
     starts_and_ends "$1" <<'END'
-import os, sqlite3
+import os, sqlite3, subprocess
 holds = os.path.exists("/data/specimap.db")
 if holds:
     database = sqlite3.connect("file:/data/specimap.db?mode=ro", uri=True, timeout=10)
     tables = database.execute("SELECT count(*) FROM sqlite_master WHERE name = 'leases'").fetchone()[0]
     holds = tables and database.execute("SELECT count(*) FROM leases").fetchone()[0] == 1
     database.close()
+holds = holds and subprocess.run(health[1:], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL).returncode == 0
 END
     cp -r samples "$("${tool[@]}" mount "$1")/samples"
     in_image "$1" specimap run --photos /samples/rgb --cube /samples/hsi/hsi.hdr --out /tmp/out --json | python3 -c '
@@ -130,6 +131,7 @@ for target in "${targets[@]}"; do
     in_image "$container" specimap --version
     in_image "$container" du -sh /opt/specimap
     in_image "$container" sh -c '! touch /opt/specimap/x 2>/dev/null && touch /data/x && rm /data/x'
+    "${PYTHON:-python3}" docker/sbom.py image "specimap-$target" "$("${tool[@]}" mount "$container")"
     if [ "$target" = service ]; then check_service "$container"; else check_worker "$container"; fi
     "${tool[@]}" rm "$container" >/dev/null
 done

@@ -17,9 +17,10 @@ from specimap_cli.contexts import contexts_app
 from specimap_cli.dicom import dicom
 from specimap_cli.doctor import doctor
 from specimap_cli.erasure import erase, verify_certificate
-from specimap_cli.errors import Debug, reported_errors, stoppable
+from specimap_cli.errors import FAILED, Debug, reported_errors, stoppable
 from specimap_cli.identity import identity_app
 from specimap_cli.keys import keys_app
+from specimap_cli.migrate import migrate
 from specimap_cli.phantom import phantom
 from specimap_cli.progress import Listener, json_listener, progress_listener
 from specimap_cli.projects import projects_app
@@ -37,6 +38,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Photos and one hyperspectral cube of an excised specimen to a metric 3D point cloud with spectra.",
 )
+
+RESEARCH_ONLY = "For research use only. Not a medical device."
 
 
 class Format(StrEnum):
@@ -176,13 +179,24 @@ def serve(
 def worker(
     slots: Annotated[int | None, typer.Option(min=1, max=64, help="Jobs side by side.")] = None,
     kind: Annotated[Kind, typer.Option(help="What the slots are.")] = Kind.cpu,
+    health: Annotated[
+        bool, typer.Option("--health", help="Start nothing: say whether the workers of this machine are alive.")
+    ] = False,
     debug: Debug = False,
 ) -> None:
     """Start workers for a service that runs elsewhere, on the same database and storage."""
+    sound = True
     with reported_errors(progress_listener(), debug):
-        from specimap_cli.serve import work
+        if health:
+            from specimap_cli.worker_health import say_health
 
-        work(slots=slots, kind=kind.value)
+            sound = say_health(typer.echo)
+        else:
+            from specimap_cli.serve import work
+
+            work(slots=slots, kind=kind.value)
+    if not sound:
+        raise typer.Exit(FAILED)
 
 
 @app.command()
@@ -217,7 +231,7 @@ def demo(
 
 def _version(asked: bool) -> None:
     if asked:
-        typer.echo(f"specimap {__version__}")
+        typer.echo(f"specimap {__version__}\n{RESEARCH_ONLY}")
         raise typer.Exit
 
 
@@ -233,6 +247,7 @@ app.command()(dicom)
 app.command()(validate)
 app.command()(phantom)
 app.command()(doctor)
+app.command()(migrate)
 app.command()(backup)
 app.command()(restore)
 app.command()(erase)

@@ -132,7 +132,7 @@ def create_app(settings: ServiceSettings, pages: Path = FOLDER) -> FastAPI:
     describe(app, extra_models=[SpectraRequest, *EVENT_TYPES.values()])
     for routes in ROUTES:
         app.include_router(routes.router)
-    app.router.routes.append(Pages(pages, settings.public_url))
+    app.router.routes.append(Pages(pages))
     # The last one added sees a request first: the limits come after CORS and the corrections of uploads, and before
     # everything that reads a body.
     app.add_middleware(Compression)
@@ -148,7 +148,7 @@ def create_app(settings: ServiceSettings, pages: Path = FOLDER) -> FastAPI:
             expose_headers=EXPOSED,
             max_age=600,
         )
-    app.add_middleware(RequestObserver, metrics=context.metrics, trail=context.trail)
+    app.add_middleware(RequestObserver, metrics=context.metrics, trail=context.trail, public_url=settings.public_url)
     return app
 
 

@@ -15,6 +15,7 @@ from specimap_infra.settings import ServiceSettings
 from specimap_service.admission import Admission, fit_open_files
 from specimap_service.errors import RequestTimeoutError, TooManyConnectionsError
 from specimap_service.problems import problem_response
+from specimap_service.security_headers import add_security_headers
 
 LARGEST_HEAD = 64 * 1024
 """Bytes of a request's line and headers; one read of the socket may go beyond."""
@@ -225,6 +226,7 @@ class Connection(HttpToolsProtocol):
 
     def _write(self, answer: Response) -> None:
         """Write an answer that no app made, the last one of the connection."""
+        add_security_headers(answer.headers, "")
         fields = [*self.server_state.default_headers, *answer.raw_headers, (b"connection", b"close")]
         head = b"".join(name + b": " + value + b"\r\n" for name, value in fields)
         self.transport.write(STATUS_LINE[answer.status_code] + head + b"\r\n" + bytes(answer.body))

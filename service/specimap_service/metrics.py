@@ -10,7 +10,7 @@ from prometheus_client import CollectorRegistry, Counter, Histogram, generate_la
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.registry import Collector
 
-from specimap_infra.database import Database, utc_now
+from specimap_infra.database import Database, database_seconds, utc_now
 from specimap_infra.errors import DatabaseUnavailableError, StorageUnavailableError
 from specimap_infra.housekeeping import count_rows, scratch_bytes
 from specimap_infra.settings import ServiceSettings
@@ -91,14 +91,16 @@ class _FromDatabase(Collector):
             oldest = session.scalar(sa.select(sa.func.min(Job.created_at)).where(Job.state == "queued"))
             errors = session.scalars(sa.select(Job.error).where(Job.state == "failed")).all()
             seconds = session.scalars(sa.select(Job.seconds).where(Job.state == "succeeded")).all()
-            workers = session.scalar(sa.select(sa.func.count()).select_from(Lease))
+            # A lease outlives its worker where nobody is left to remove it.
+            oldest_beat = database_seconds(self._database.engine) - self._settings.lease_seconds
+            workers = session.scalar(sa.select(sa.func.count()).where(Lease.heartbeat >= oldest_beat))
         jobs = GaugeMetricFamily("specimap_jobs", "Jobs by state.", labels=("state",))
         for state in JOB_STATES:
             jobs.add_metric((state,), counts.get(state, 0))
         yield jobs
         age = (utc_now() - oldest).total_seconds() if oldest else 0.0
         yield GaugeMetricFamily("specimap_queue_wait_seconds", "Age of the oldest queued job.", value=max(age, 0.0))
-        yield GaugeMetricFamily("specimap_workers", "Workers that say they are alive.", value=workers or 0)
+        yield GaugeMetricFamily("specimap_workers", "Workers whose heartbeat is fresh.", value=workers or 0)
         failures = CounterMetricFamily("specimap_jobs_fail", "Failed jobs by code.", labels=("code",))
         by_code: dict[str, int] = {}
         for error in errors:

@@ -20,7 +20,7 @@ from specimap_service.audit_trail import AuditTrail
 from specimap_service.context import ANSWER_HEADERS
 from specimap_service.metrics import Metrics
 from specimap_service.problems import problem_response
-from specimap_service.security_headers import add_policy
+from specimap_service.security_headers import add_security_headers
 
 HEADER = b"x-correlation-id"
 ACCEPTED = re.compile(rb"^[A-Za-z0-9._-]{8,64}$")
@@ -33,10 +33,11 @@ class RequestObserver:
     It logs no address, key or uploaded name.
     """
 
-    def __init__(self, app: ASGIApp, metrics: Metrics, trail: AuditTrail) -> None:
+    def __init__(self, app: ASGIApp, metrics: Metrics, trail: AuditTrail, public_url: str = "") -> None:
         self._app = app
         self._metrics = metrics
         self._trail = trail
+        self._public_url = public_url
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on."""
@@ -62,11 +63,10 @@ class RequestObserver:
                     # Before the first byte of the answer.
                     self._trail.record(access, correlation)
                 given_headers = MutableHeaders(raw=list(message.get("headers", [])))
-                add_policy(given_headers, scope["path"])
+                add_security_headers(given_headers, scope["path"], self._public_url)
                 message["headers"] = [
                     *given_headers.raw,
                     (HEADER, correlation.encode()),
-                    (b"x-content-type-options", b"nosniff"),
                     *((name.lower().encode(), value.encode()) for name, value in more.items()),
                 ]
             await send(message)

@@ -111,9 +111,9 @@ class Pages(BaseRoute):
     path = path_format = name = NAME
     """Under which metrics and log count their requests."""
 
-    def __init__(self, folder: Path, public_url: str) -> None:
+    def __init__(self, folder: Path) -> None:
         self._files = read_pages(folder)
-        self._headers = page_headers(public_url)
+        self._headers = page_headers()
 
     def matches(self, scope: Scope) -> tuple[Match, Scope]:
         """Match a request for one of the files."""

@@ -24,22 +24,24 @@ PAGES = (
 HSTS_SECONDS = 365 * 24 * 3600
 
 
-def page_headers(public_url: str) -> dict[str, str]:
-    """Return the headers of the service's pages. ``public_url``: how browsers reach them, empty where unknown."""
-    headers = {
+def page_headers() -> dict[str, str]:
+    """Return the headers of the service's pages, besides those that every answer carries."""
+    return {
         "Content-Security-Policy": PAGES,
-        "Referrer-Policy": "no-referrer",
         "Permissions-Policy": "camera=(self), microphone=(), geolocation=()",
         "X-Frame-Options": "DENY",
         "Cross-Origin-Opener-Policy": "same-origin",
     }
+
+
+def add_security_headers(headers: MutableHeaders, path: str, public_url: str = "") -> None:
+    """Add what every answer carries to one for a request of this path; what the answer has of its own stays."""
+    headers["x-content-type-options"] = "nosniff"
+    headers.setdefault("referrer-policy", "no-referrer")
+    # What may be kept says so itself: neither a browser nor a proxy keeps the rest.
+    headers.setdefault("cache-control", "no-store")
     if public_url.lower().startswith("https://"):
-        headers["Strict-Transport-Security"] = f"max-age={HSTS_SECONDS}"
-    return headers
-
-
-def add_policy(headers: MutableHeaders, path: str) -> None:
-    """Add the policy to an answer to a request of this path, unless it has one of its own."""
+        headers["strict-transport-security"] = f"max-age={HSTS_SECONDS}"
     if POLICY in headers:
         return
     if path in DESCRIPTION_PATHS:

@@ -150,7 +150,7 @@ def test_what_the_pdf_says(finished: Finished, tmp_path: Path) -> None:
     for output in (
         "Accuracy report",
         "Verdict",
-        "Not a medical device",
+        "For research use only. Not a medical device",
         f"{report.corner_2d_mm.mean:.3f} ± {report.corner_2d_mm.std:.3f}",
         f"{report.leave_one_marker_out_mm.median:.3f} ({report.leave_one_marker_out_mm.maximum:.3f})"
         if report.leave_one_marker_out_mm

@@ -41,7 +41,9 @@ def read_until(process: subprocess.Popen[str], stage: str, share: float) -> None
 
 
 def test_version_and_help() -> None:
-    assert __version__ in specimap("--version").out
+    said = specimap("--version").out
+    assert __version__ in said
+    assert "For research use only. Not a medical device." in said
     assert "--photos" in specimap("run", "--help").out
     assert specimap("run").status == 2
 

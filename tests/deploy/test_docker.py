@@ -87,7 +87,7 @@ def test_an_image_installs_its_own_extra_alone_at_the_locked_versions(target: st
         assert "--constraint requirements.lock" in command or "--no-deps --no-index" in command
 
 
-def test_only_the_service_listens_and_its_health_is_asked_for() -> None:
+def test_only_the_service_listens_and_the_health_of_all_is_asked_for() -> None:
     for target in IMAGES:
         ports = [rest for word, rest in lineage(target) if word == "EXPOSE"]
         health = [rest for word, rest in lineage(target) if word == "HEALTHCHECK"][-1]
@@ -97,7 +97,7 @@ def test_only_the_service_listens_and_its_health_is_asked_for() -> None:
             assert ("CMD", '["serve", "--no-worker"]') in lineage(target)
         else:
             assert ports == []
-            assert health == "NONE"
+            assert health.endswith('CMD ["specimap", "worker", "--health"]')
 
 
 def test_nothing_is_fetched_by_address_and_no_secret_is_built_in() -> None:
@@ -218,7 +218,7 @@ def test_compose_file_is_what_the_specification_asks_for(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", COMPOSE)
-@pytest.mark.parametrize("profiles", ["", "tls", "data", "api", "worker", "gpu", "data,api,worker"])
+@pytest.mark.parametrize("profiles", ["", "tls", "data", "api", "worker", "gpu", "hospital", "data,api,worker"])
 def test_compose_itself_takes_the_file(name: str, profiles: str) -> None:
     command = ["docker", "compose"]
     if not shutil.which("docker") or subprocess.run([*command, "version"], capture_output=True, timeout=60).returncode:
@@ -248,18 +248,45 @@ def test_example_names_every_variable_and_gives_no_secret() -> None:
     assert [named[name] for name in GIVEN] == [""] * len(GIVEN)
 
 
+GIVEN_BACK = {"proxy": ["NET_BIND_SERVICE"], "database": ["CHOWN", "DAC_OVERRIDE", "FOWNER", "SETGID", "SETUID"]}
+"""Capabilities that an image of others needs to start."""
+OPEN = {"proxy": "443:443"}
+
+
 @pytest.mark.parametrize("name", COMPOSE)
 def test_containers_are_locked_down_and_nothing_is_open_but_the_proxy(name: str) -> None:
     for service, parts in services(name).items():
         assert "no-new-privileges:true" in parts["security_opt"], service
         assert not parts.get("privileged")
-        if service != "database":  # PostgreSQL's image changes its user itself
-            assert parts["read_only"] is True, service
-            assert parts["cap_drop"] == ["ALL"], service
-            assert any(str(place).startswith("/tmp") for place in parts["tmpfs"]) or service == "proxy"
-        assert parts["mem_limit"] if service != "bucket" else True
+        assert parts["read_only"] is True, service
+        assert parts["cap_drop"] == ["ALL"], service
+        assert parts.get("cap_add", []) == GIVEN_BACK.get(service, [])
+        assert any(str(place).startswith("/tmp") for place in parts["tmpfs"]) or service == "proxy"
+        assert parts["mem_limit"]
+        assert parts["pids_limit"]
         for port in parts.get("ports", []):
-            assert port.startswith("127.0.0.1:") or (service, port) == ("proxy", "443:443")
+            assert port.startswith("127.0.0.1:") or port == OPEN.get(service)
+
+
+@pytest.mark.parametrize("name", COMPOSE)
+def test_every_container_that_goes_on_has_a_health_check(name: str) -> None:
+    for service, parts in services(name).items():
+        ours = OURS.match(parts["image"])
+        if service == "bucket":  # it ends
+            assert parts["restart"] == "no"
+        elif "healthcheck" in parts:
+            assert parts["healthcheck"]["test"][0] == "CMD"
+        else:  # that of the image, which is for the image's own command
+            assert ours
+            assert "command" not in parts
+
+
+@pytest.mark.parametrize("name", COMPOSE)
+def test_hospital_starts_only_where_it_is_asked_for(name: str) -> None:
+    hospital = services(name)["hospital"]
+    assert hospital["profiles"] == ["hospital"]
+    assert hospital["command"] == ["hospital"]
+    assert hospital["healthcheck"]["test"] == ["CMD", "specimap", "hospital", "--health"]
 
 
 @pytest.mark.parametrize("name", COMPOSE)

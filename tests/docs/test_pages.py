@@ -19,7 +19,8 @@ FOLDERS = "core|infra|service|workers|cli|validation|client|tests|bench|docker|d
 PAGES = [
     README,
     CONTRIBUTING,
-    *sorted(DOCS.glob("*.md")),
+    ROOT / "SECURITY.md",
+    *sorted(DOCS.rglob("*.md")),
     ROOT / "samples" / "README.md",
     ROOT / "client" / "README.md",
 ]
@@ -66,7 +67,7 @@ def test_links_lead_to_a_file_and_a_heading(page: Path) -> None:
 
 def test_the_index_links_to_every_page() -> None:
     index = (DOCS / "README.md").read_text("utf-8")
-    pages = {page.name for page in DOCS.glob("*.md")} - {"README.md"}
+    pages = {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md")} - {"README.md"}
     assert {name for name in pages if f"]({name})" not in index} == set()
 
 

@@ -27,8 +27,9 @@ class LeaseKeeper:
     """Renews one worker's lease in a thread, and looks after others.
 
     At a heartbeat ``look_after`` gets the executors that live, or None while it is too early to judge others by their
-    leases; ``settle`` is called once a lease. Of many workers only some do either at a time: what one finds grows with
-    their number, so what all find would grow with its square.
+    leases; ``settle`` is called once a lease; ``beat`` at every heartbeat, also while the database is away. Of many
+    workers only some look after others at a time: what one finds grows with their number, so what all find would grow
+    with its square.
     """
 
     def __init__(
@@ -41,6 +42,7 @@ class LeaseKeeper:
         lease_seconds: float,
         look_after: Callable[[set[str] | None], None],
         settle: Callable[[], None],
+        beat: Callable[[], None] = lambda: None,
     ) -> None:
         self._database = database
         self._executor = executor
@@ -50,6 +52,7 @@ class LeaseKeeper:
         self._ttl = lease_seconds
         self._look_after = look_after
         self._settle = settle
+        self._beat = beat
         self._leased = False
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="lease", daemon=True)
@@ -74,6 +77,7 @@ class LeaseKeeper:
         renewed = settled = time.monotonic()
         while not self._stop.wait(self._heartbeat):
             try:
+                self._beat()
                 self._renew()
                 now = time.monotonic()
                 # After an outage or a freeze the others may not have had their turn yet: wait a lease before judging.
@@ -84,7 +88,7 @@ class LeaseKeeper:
                     self._look_after(None)
                     continue
                 living = self._living()
-                if random.random() * len(living) > LOOKING:
+                if random.random() * len(living) > LOOKING:  # noqa: S311 - spreads work, keeps no secret
                     continue
                 self._look_after(living)
                 if now - settled >= self._ttl:

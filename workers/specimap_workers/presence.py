@@ -37,6 +37,11 @@ class Presence:
             self._note.flush()
             os.rename(aside, self._folder / f"{suffix}.lock")
 
+    def beat(self) -> None:
+        """Show that this worker not only exists but gets on: its note is as old as its last beat."""
+        if self._note is not None:
+            os.utime(self._note.fileno())
+
     def dead(self) -> list[str]:
         """Return the executors of this machine that have ended and whose notes are still there."""
         return [executor for path in self._folder.glob("*.lock") if (executor := _ended(path)) is not None]
@@ -47,6 +52,18 @@ class Presence:
         for folder in self._folder.glob(f"*.{suffix}"):
             remove(folder)
         remove(self._folder / f"{suffix}.lock")
+
+
+def living(folder: Path) -> list[tuple[str, float]]:
+    """Return the executors whose notes in a folder are locked, each with the time of its last beat (Unix, s)."""
+    found = []
+    for path in folder.glob("*.lock"):
+        with suppress(OSError), open(path, encoding="ascii") as note:
+            try:
+                fcntl.flock(note, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                found.append((note.read() or path.stem, os.fstat(note.fileno()).st_mtime))
+    return found
 
 
 def _ended(path: Path) -> str | None:

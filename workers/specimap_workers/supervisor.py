@@ -90,7 +90,7 @@ class Supervisor:
                 if self._stopping.is_set():
                     return
                 # In a session of its own: Ctrl-C reaches the parent alone, which then ends the children in order.
-                child = subprocess.Popen(command, start_new_session=True)
+                child = subprocess.Popen(command, start_new_session=True)  # noqa: S603 - this program itself
                 self._children[slot] = executor, child
             status = child.wait()
             if self._stopping.is_set():

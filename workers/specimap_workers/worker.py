@@ -124,6 +124,7 @@ class Worker:
             lease_seconds=self.settings.lease_seconds,
             look_after=self._look_after,
             settle=self._reaper.settle,
+            beat=self._presence.beat,
         )
         keeper.start()
         for number in (signal.SIGTERM, signal.SIGINT):

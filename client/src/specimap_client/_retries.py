@@ -31,7 +31,8 @@ class Retries:
     def delay(self, attempt: int, retry_after: float | None = None) -> float:
         """Seconds to wait after the attempt, counted from 0."""
         # Jitter: clients that a restart cut off at once must not come back at once.
-        wait: float = min(self.cap_s, self.first_s * 2 ** min(attempt, 30)) * random.uniform(0.5, 1.0)
+        jitter = random.uniform(0.5, 1.0)  # noqa: S311 - keeps no secret
+        wait: float = min(self.cap_s, self.first_s * 2 ** min(attempt, 30)) * jitter
         return wait if retry_after is None else max(retry_after, 0.0) + wait * 0.1
 
 

@@ -69,7 +69,8 @@ def compose(material: Material) -> Document:
         title="Accuracy report",
         subtitle=f"Run of {_date(report.created)}, method {report.method}",
         created=report.created,
-        footer=f"Specimap {report.specimap_version}. Not a medical device; not validated for clinical decisions.",
+        footer=f"Specimap {report.specimap_version}. For research use only. Not a medical device; not validated for "
+        "clinical decisions.",
         sections=tuple(sections),
     )
 

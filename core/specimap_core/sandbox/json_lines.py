@@ -83,7 +83,7 @@ class JsonLineProcess:
         self._messages, childs_end = os.pipe()
         try:
             with open(log, "wb") if log else nullcontext() as output:
-                self._process = subprocess.Popen(
+                self._process = subprocess.Popen(  # noqa: S603 - commands of Specimap's own
                     [*command, str(childs_end)] if log else list(command),
                     stdin=subprocess.PIPE if takes_messages else subprocess.DEVNULL,
                     stdout=output or childs_end,

@@ -135,7 +135,7 @@ def main(arguments: list[str]) -> None:
     plan = json.loads(arguments[0])
     try:
         Confinement([(place, rights) for place, rights in plan["rules"]], plan["mode"]).enter(alone=False)
-        os.execv(arguments[1], arguments[1:])
+        os.execv(arguments[1], arguments[1:])  # noqa: S606 - a command of Specimap's own
     except OSError as error:
         sys.stderr.write(f"The process could not be confined: {error}.\n")
         sys.stderr.flush()

@@ -42,7 +42,7 @@ _SQLITE = (
     BEGIN SELECT RAISE(ABORT, '{MESSAGE}'); END""",
     f"""CREATE TRIGGER audit_delete BEFORE DELETE ON audit
     WHEN OLD.seq IS NULL OR OLD.seq > coalesce((SELECT max(pruned_seq) FROM audit_head), 0)
-    BEGIN SELECT RAISE(ABORT, '{MESSAGE}'); END""",
+    BEGIN SELECT RAISE(ABORT, '{MESSAGE}'); END""",  # noqa: S608 - a constant of this module
 )
 _WITHOUT = "".join(f" - '{name}'" for name in _SEALED)
 _POSTGRESQL = (
@@ -59,7 +59,7 @@ _POSTGRESQL = (
             END IF;
         END IF;
         RAISE EXCEPTION '{MESSAGE}';
-    END $$""",
+    END $$""",  # noqa: S608 - constants of this module
     """CREATE TRIGGER audit_update BEFORE UPDATE ON audit
     FOR EACH ROW EXECUTE FUNCTION specimap_audit_guard()""",
     """CREATE TRIGGER audit_delete BEFORE DELETE ON audit

@@ -58,7 +58,7 @@ def probe(python: str, modules: tuple[str, ...]) -> dict[str, Any]:
     environment = child_environment(Path.cwd(), {})
     environment.pop("TMPDIR")
     try:
-        done = subprocess.run(
+        done = subprocess.run(  # noqa: S603 - the interpreter that the settings of backends name
             [python, "-c", PROBE, ",".join(modules), ",".join(IMPORTED)],
             capture_output=True,
             text=True,
@@ -81,7 +81,8 @@ def driver_gpus() -> tuple[dict[str, Any], ...]:
         return ()
     try:
         done = subprocess.run(
-            ["nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader,nounits"],
+            # Wherever the driver has put it.
+            ["nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader,nounits"],  # noqa: S607
             capture_output=True,
             text=True,
             timeout=PROBE_SECONDS,
