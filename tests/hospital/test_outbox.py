@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import datetime
+import io
 import shutil
 import socket
+import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -322,3 +324,28 @@ def test_settings_say_whether_there_is_work(tmp_path: Path) -> None:
     assert has(pacs_url="https://pacs.example/dicom-web")
     assert has(pacs_host="pacs.example")
     assert has(dicom_port=11112)
+
+
+# ---- the ZIP ------------------------------------------------------------------------------------------
+
+
+def test_the_first_set_comes_as_a_zip_and_leaves_nothing(tmp_path: Path) -> None:
+    with serving(tmp_path / "service", study_keys=[KEY]) as running:
+        client = running.client()
+        result = put_result(running, tmp_path / "result")
+        path = f"/v1/clouds/{result.cloud_id}/dicom.zip"
+        missing = client.get(path)
+        assert (missing.status_code, missing.json()["code"]) == (409, "study_missing")
+        client.put(f"/v1/acquisitions/{result.acquisition_id}/study", json=as_json())
+        answer = client.get(path)
+        assert answer.status_code == 200
+        assert answer.headers["cache-control"] == "no-store"
+        with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+            names = archive.namelist()
+            assert archive.testzip() is None
+        assert any(name.endswith("DICOMDIR") for name in names)
+        assert len(names) > 4
+        assert not any(text in name for text in PLANTED for name in names)
+        assert not list(running.settings.scratch.glob("dicom-*"))
+        assert client.head(path).status_code in (200, 405)
+        assert running.client(["read"]).get(path).status_code == 403

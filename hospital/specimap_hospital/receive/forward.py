@@ -5,7 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from specimap_hospital.connections import PeerError, dicomweb, web_errors
-from specimap_hospital.receive.classes import CANNOT_UNDERSTAND, NOT_AUTHORISED, OUT_OF_RESOURCES
+from specimap_hospital.receive.classes import (
+    CANNOT_PROCESS,
+    CANNOT_UNDERSTAND,
+    NOT_AUTHORISED,
+    NOT_SUPPORTED,
+    OUT_OF_RESOURCES,
+)
 from specimap_infra.logs import logger
 from specimap_infra.settings import ServiceSettings
 
@@ -15,6 +21,7 @@ if TYPE_CHECKING:
 SECONDS = 300.0
 SUCCESS = 0x0000
 CONFLICT = 409
+OF_STORE = (CANNOT_PROCESS, NOT_SUPPORTED, NOT_AUTHORISED)
 
 
 def forwarded(settings: ServiceSettings, dataset: Dataset) -> int:
@@ -45,4 +52,7 @@ def forwarded(settings: ServiceSettings, dataset: Dataset) -> int:
 
 def _failure(answer: dict[str, Any]) -> int:
     code: int = answer["00081198"]["Value"][0]["00081197"]["Value"][0]
-    return code if 0 < code <= 0xFFFF else CANNOT_UNDERSTAND
+    if not 0 < code <= 0xFFFF:
+        return CANNOT_UNDERSTAND
+    # A C-STORE knows few codes; whatever else it is goes into those that mean that an object is not understood.
+    return code if code in OF_STORE or code >= OUT_OF_RESOURCES else CANNOT_UNDERSTAND | code & 0x0FFF

@@ -9,6 +9,7 @@ import type { Viewpoints } from "./dome/geometry";
 import { useViewpoints } from "./dome/viewpoints";
 import { JobPanel } from "./job/job-panel";
 import { Notices } from "./notices";
+import { OrderPanel } from "./order/order-panel";
 import { photosOf, tallied, WANTED } from "./photos/checks";
 import { PhotoPanel } from "./photos/photo-panel";
 import { t } from "./texts";
@@ -41,6 +42,7 @@ export function CaptureView({ id }: { id: string }) {
       <p class="small">{t("hold")}</p>
       <Notices unreachable={lost} />
       {problem && !lost && <ProblemBox problem={problem} again={refresh} />}
+      <OrderPanel acquisition={id} />
       <div class="sides">
         <PhotoPanel
           acquisition={id}
