@@ -44,7 +44,7 @@ def certified_provider(port: int, public_url: str, keys: Sequence[ECKey]) -> Ite
         "post_logout_redirect_uri": f"{public_url}/",
         "audience": AUDIENCE,
     }
-    command = [node(), FOLDER / "server.mjs", str(port), json.dumps(settings)]
+    command: list[str | Path] = [node(), FOLDER / "server.mjs", str(port), json.dumps(settings)]
     # In a session of its own: what npm packages call node may be a program that starts the real one.
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
