@@ -24,7 +24,7 @@ help:
 	@echo "make setup   install the pinned versions into $(VENV), and build the web pages"
 	@echo "make learned add PyTorch and the learned features"
 	@echo "make path-traced add Mitsuba, for path-traced phantoms"
-	@echo "make identity-provider add Canaille, at which the tests sign in, in an environment of its own"
+	@echo "make identity-provider add the identity providers at which the tests sign in: Canaille and oidc-provider"
 	@echo "make demo    set up, then run samples/ through a service of its own into $(DEMO_OUT)"
 	@echo "make test    set up, with the learned features, then run all tests"
 	@echo "make test-pages   the tests of the web pages that need no service"
@@ -41,8 +41,13 @@ help:
 
 setup: $(STAMP) pages
 
-# In an environment of its own, since it pins what it needs.
-identity-provider: .venv-canaille/bin/canaille
+# Canaille is in an environment of its own, since it pins what it needs.
+CERTIFIED := tests/support/oidc_provider
+identity-provider: .venv-canaille/bin/canaille $(CERTIFIED)/node_modules/.specimap-installed
+
+$(CERTIFIED)/node_modules/.specimap-installed: $(CERTIFIED)/package-lock.json | $(STAMP)
+	@PATH="$(CURDIR)/$(RUN):$$PATH" npm --prefix $(CERTIFIED) ci --silent --no-audit --no-fund
+	@touch $@
 
 .venv-canaille/bin/canaille:
 	@"$(PYTHON)" -m venv .venv-canaille
@@ -134,4 +139,4 @@ check-install: wheel
 	docker/check_install.sh out/dist/specimap-*.whl
 
 clean:
-	rm -rf $(VENV) .venv-canaille out web/node_modules service/specimap_service/pages
+	rm -rf $(VENV) .venv-canaille $(CERTIFIED)/node_modules out web/node_modules service/specimap_service/pages

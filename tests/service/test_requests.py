@@ -136,6 +136,10 @@ def test_no_operation_takes_a_parameter_that_it_does_not_know(scene: tuple[Runni
     for method, path, query in operations(service.app):
         at = filled(path, ids)
         answer = client.request(method, at, params={"specimen": "x"}, headers={**TUS, "Specimap-Page": "1"})
+        if path == "/v1/sso/callback":
+            # An identity provider adds parameters of its own.
+            assert answer.json()["code"] == "sign_in_not_configured"
+            continue
         assert answer.status_code == 422, (method, path, answer.text)
         if method != "HEAD":
             problem = answer.json()

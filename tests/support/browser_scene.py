@@ -106,7 +106,7 @@ def context(browser: Browser) -> Iterator[BrowserContext]:
 def window(context: BrowserContext) -> Iterator[Window]:
     """A page; the test fails if a script in it does, or if the content-security policy refuses something."""
     window = Window(context.new_page())
-    window.page.on("pageerror", lambda error: window.errors.append(str(error)))
+    window.page.on("pageerror", lambda error: window.errors.append(f"{error.stack or error}"))
     window.page.on(
         "console",
         lambda said: window.errors.append(said.text) if "Content Security Policy" in said.text else None,

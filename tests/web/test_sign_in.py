@@ -11,12 +11,14 @@ from typing import Any
 
 import pytest
 import sqlalchemy as sa
+from joserfc.jwk import ECKey
 from playwright.sync_api import Page, expect
 
 from specimap_infra.tables import AuditEntry, Person
 from specimap_service.auth.people import subject_hash
 from tests.support.browser_scene import Window
 from tests.support.canaille import CLIENT_ID, CLIENT_SECRET, PASSWORD, Canaille, canaille_running
+from tests.support.certified_provider import certified_provider
 from tests.support.service_scene import Running, serving
 
 pytestmark = pytest.mark.slow
@@ -70,9 +72,9 @@ def sign_in(page: Page, name: str) -> None:
     page.wait_for_url(re.compile(r"/#/"))
 
 
-def own_errors(window: Window) -> None:
-    """Leave out what the provider's pages do against their own policy."""
-    window.errors[:] = [error for error in window.errors if "style" not in error]
+def own_errors(window: Window, issuer: str) -> None:
+    """Leave out what fails in the provider's pages, and what these do against their own policy."""
+    window.errors[:] = [error for error in window.errors if "style" not in error and issuer not in error]
 
 
 def test_a_technician_signs_in_comes_back_and_signs_out(window: Window, hospital: Hospital) -> None:
@@ -97,7 +99,7 @@ def test_a_technician_signs_in_comes_back_and_signs_out(window: Window, hospital
     page.goto(url)
     expect(page.get_by_test_id("sign-in-account")).to_be_visible()
     assert page.evaluate("fetch('/v1/session').then(answer => answer.status)") == 401
-    own_errors(window)
+    own_errors(window, hospital.provider.issuer)
 
 
 def test_an_auditor_sees_the_trail_alone(window: Window, hospital: Hospital) -> None:
@@ -108,7 +110,7 @@ def test_an_auditor_sees_the_trail_alone(window: Window, hospital: Hospital) -> 
     expect(page.get_by_test_id("audit")).to_contain_text("session.create")
     for name in ("Acquisitions", "Jobs", "Results"):
         assert page.get_by_role("link", name=name).count() == 0
-    own_errors(window)
+    own_errors(window, hospital.provider.issuer)
 
 
 def test_an_account_without_a_role_is_told_so(window: Window, hospital: Hospital) -> None:
@@ -119,7 +121,7 @@ def test_an_account_without_a_role_is_told_so(window: Window, hospital: Hospital
     page.get_by_label("Language").select_option("it")
     expect(page.get_by_test_id("sign-in-refused")).to_contain_text("non ha alcun ruolo")
     expect(page.get_by_test_id("sign-in-account")).to_have_text("Accedi con il tuo account di St. Example")
-    own_errors(window)
+    own_errors(window, hospital.provider.issuer)
 
 
 def test_while_the_provider_is_away_a_key_signs_in(window: Window, tmp_path: Path) -> None:
@@ -137,3 +139,35 @@ def test_while_the_provider_is_away_a_key_signs_in(window: Window, tmp_path: Pat
         expect(page.get_by_test_id("sign-in-refused")).to_contain_text("does not answer")
         window.sign_in(service.url, service.key())
         expect(page.get_by_role("heading", name="Acquisitions")).to_be_visible()
+
+
+def test_a_certified_provider_whose_userinfo_has_the_roles(window: Window, tmp_path: Path) -> None:
+    port = free_port()
+    url = f"http://127.0.0.1:{port}"
+    key = ECKey.generate_key("P-256", {"kid": "first", "use": "sig", "alg": "ES256"})
+    with certified_provider(free_port(), url, [key]) as issuer:
+        settings: dict[str, Any] = {
+            "oidc_issuer": issuer,
+            "oidc_client_id": CLIENT_ID,
+            "oidc_client_secret": CLIENT_SECRET,
+            "oidc_scopes": "openid roles",
+            "oidc_roles": {"specimap-admin": "admin"},
+            "public_url": url,
+        }
+        with serving(tmp_path, bound=port, **settings):
+            page = window.page
+            page.goto(url)
+            page.get_by_test_id("sign-in-account").click()
+            page.locator("input[name=login]").fill("admin")
+            page.locator("input[name=password]").fill("any")
+            page.locator("button[type=submit]").click()
+            # It asks whether Specimap may know who that is.
+            page.locator("button[type=submit]").click()
+            page.wait_for_url(re.compile(rf"{re.escape(url)}/#/"))
+            expect(page.get_by_test_id("roles")).to_have_text("Administrator")
+            page.get_by_role("button", name="Sign out").click()
+            page.wait_for_url(re.compile(rf"{re.escape(issuer)}/session/end"))
+            page.get_by_role("button", name="Yes").click()
+            page.wait_for_url(re.compile(rf"{re.escape(url)}/"))
+            expect(page.get_by_test_id("sign-in-account")).to_be_visible()
+            own_errors(window, issuer)

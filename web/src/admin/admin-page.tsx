@@ -1,7 +1,7 @@
 import { api, body, fetched, type Schemas } from "../api/client";
 import { usePolled } from "../api/polling";
 import { Problem } from "../api/problem";
-import { may } from "../app/session";
+import { isPerson, may } from "../app/session";
 import { bytes, moment, number } from "../i18n";
 import { stateName, type StateKey } from "../i18n/states";
 import { ProblemBox } from "../ui/boxes";
@@ -14,7 +14,8 @@ import { t } from "./texts";
 /** Keys, projects, workers, queue and storage, for administrators; the audit trail, for auditors too. */
 export default function AdminPage() {
   if (!may("audit.read")) {
-    const refused = new Problem("forbidden", "This is for administrators.", "", 403, { permission: "key.manage" });
+    const lacking = isPerson() ? { permission: "key.manage" } : { scope: "admin" };
+    const refused = new Problem("forbidden", "This is for administrators.", "", 403, lacking);
     return (
       <div class="page">
         <ProblemBox problem={refused} />
