@@ -135,8 +135,10 @@ class AuditTrail:
                 self._refused_until = now + INTERVAL_SECONDS
             if access not in self._kinds:
                 who = access.actor, access.address
-                self._refused[who] += 1
-                if self._refused[who] > MOST_REFUSED or len(self._refused) > MOST_KINDS:
+                told_apart = who in self._refused or len(self._refused) < MOST_KINDS
+                if told_apart:
+                    self._refused[who] += 1
+                if not told_apart or self._refused[who] > MOST_REFUSED:
                     access = Access(
                         access.actor, "", access.project_id, SEVERAL, "", access.outcome, access.status, access.address
                     )

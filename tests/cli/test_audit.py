@@ -66,6 +66,7 @@ def test_what_is_refused(tmp_path: Path) -> None:
     assert none.returncode == 2
 
 
+@pytest.mark.slow
 @pytest.mark.waits
 def test_what_was_answered_a_second_ago_outlives_a_killed_service(tmp_path: Path) -> None:
     given = {"data_dir": tmp_path / "data", "port": 0, "min_free_bytes": 0}

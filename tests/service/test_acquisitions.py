@@ -184,7 +184,8 @@ def test_deleted_with_everything(service: Running) -> None:
     assert admin.delete(address).json()["code"] == "not_found"
     assert admin.get(f"{address}/files").json()["code"] == "not_found"
     with service.database.session() as session:
-        for table in Base.metadata.sorted_tables:
+        # The audit trail outlives what it tells of.
+        for table in (table for table in Base.metadata.sorted_tables if table.name != "audit"):
             if "acquisition_id" in table.c or table.name == "job_events":
                 column = table.c["acquisition_id" if "acquisition_id" in table.c else "job_id"]
                 assert acquisition not in session.scalars(sa.select(column)).all()
