@@ -185,8 +185,8 @@ def test_a_phones_twelve_megapixels(tmp_path: Path, orientation: int) -> None:
 
 def test_the_profile_of_the_colours_is_kept(tmp_path: Path) -> None:
     profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-    options: dict[str, Any]
-    for name, options in (("kept.jpg", {}), ("anew.jpg", {"progressive": True}), ("anew.png", {})):
+    cases: dict[str, dict[str, Any]] = {"kept.jpg": {}, "anew.jpg": {"progressive": True}, "anew.png": {}}
+    for name, options in cases.items():
         path = tmp_path / name
         Image.fromarray(pattern()).save(path, icc_profile=profile, **options)
         assert bytes(photo_of(path, tmp_path / "out").ICCProfile)[: len(profile)] == profile
