@@ -188,9 +188,9 @@ def worker(
     sound = True
     with reported_errors(progress_listener(), debug):
         if health:
-            from specimap_cli.worker_health import say_health
+            from specimap_cli.health import say_health_of_workers
 
-            sound = say_health(typer.echo)
+            sound = say_health_of_workers(typer.echo)
         else:
             from specimap_cli.serve import work
 

@@ -1,59 +1,40 @@
-"""The health of the workers of a machine, as a container's health check asks for it."""
+"""The health of the processes of a machine, as a container's health check asks for it."""
 
 from __future__ import annotations
 
 import os
 import signal
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
-from specimap_infra.settings import load_settings
-from specimap_workers.health import SILENT_LEASES, workers_here
-from specimap_workers.presence import Presence
+from specimap_infra.heartbeats import Note, health_of
 from tests.support.serve_scene import running
 from tests.support.worker_scene import until
 
 
-@contextmanager
-def present(folder: Path, executor: str) -> Iterator[Presence]:
-    """A worker's note, for the time of the block."""
-    presence = Presence(folder, executor)
-    presence.announce()
-    try:
-        yield presence
-    finally:
-        assert presence._note is not None
-        presence._note.close()
+def test_processes_of_other_hosts_and_dead_ones_do_not_count(tmp_path: Path) -> None:
+    assert not health_of(tmp_path / "nowhere", 90, "here").sound
+    with closing(Note.leave(tmp_path, "a", "there:0:a")):
+        assert not health_of(tmp_path, 90, "here").sound
+        with closing(Note.leave(tmp_path, "b", "here:0:b")):
+            assert health_of(tmp_path, 90, "here").lively == ("here:0:b",)
+            assert health_of(tmp_path, 90, "here").sound
+        # A note that outlived its process is not locked.
+        assert (tmp_path / "b.lock").exists()
+        assert not health_of(tmp_path, 90, "here").sound
 
 
-def test_workers_of_other_hosts_and_dead_ones_do_not_count(tmp_path: Path) -> None:
-    settings = load_settings(data_dir=tmp_path, lease_seconds=10.0)
-    work = settings.scratch / "work"
-    assert not workers_here(settings, "here").sound
-    with present(work, "there:0:aaaa"):
-        assert not workers_here(settings, "here").sound
-        with present(work, "here:0:bbbb"):
-            assert workers_here(settings, "here").lively == ("here:0:bbbb",)
-            assert workers_here(settings, "here").sound
-        # A note that outlived its worker is not locked.
-        assert (work / "bbbb.lock").exists()
-        assert not workers_here(settings, "here").sound
-
-
-def test_a_worker_that_lives_and_does_not_get_on_is_silent_until_it_beats(tmp_path: Path) -> None:
-    settings = load_settings(data_dir=tmp_path, lease_seconds=10.0)
-    work = settings.scratch / "work"
-    with present(work, "here:0:aaaa") as presence:
-        past = time.time() - SILENT_LEASES * settings.lease_seconds - 1
-        os.utime(work / "aaaa.lock", (past, past))
-        assert workers_here(settings, "here").silent == ("here:0:aaaa",)
-        assert not workers_here(settings, "here").sound
-        presence.beat()
-        assert workers_here(settings, "here").sound
+def test_a_process_that_lives_and_does_not_get_on_is_silent_until_it_beats(tmp_path: Path) -> None:
+    with closing(Note.leave(tmp_path, "a", "here:0:a")) as note:
+        past = time.time() - 91
+        os.utime(tmp_path / "a.lock", (past, past))
+        assert health_of(tmp_path, 90, "here").silent == ("here:0:a",)
+        assert not health_of(tmp_path, 90, "here").sound
+        note.beat()
+        assert health_of(tmp_path, 90, "here").sound
 
 
 @pytest.mark.slow
