@@ -19,13 +19,13 @@ Long = Annotated[str, StringConstraints(strip_whitespace=True, max_length=64, pa
 class OrderQuery(BaseModel):
     """What an order is looked up by: at least one of the three."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, json_schema_extra={"example": {"accession_number": "A-2026-0117"}}
+    )
 
     accession_number: Short = Field(default="", description="Of the order.")
     patient_id: Long = Field(default="", description="Of the patient.")
-    station: Short = Field(
-        default="", description="Title of the station that the step is scheduled for."
-    )
+    station: Short = Field(default="", description="Title of the station that the step is scheduled for.")
 
     @model_validator(mode="after")
     def _asks_for_something(self) -> OrderQuery:
@@ -39,9 +39,7 @@ class Order(BaseModel):
 
     source: Literal["worklist", "qido"] = Field(description="Where it was found.")
     study: StudyContext = Field(description="PUT it as the acquisition's study context to choose the order.")
-    scheduled_at: datetime.datetime | None = Field(
-        default=None, description="Local time of the hospital."
-    )
+    scheduled_at: datetime.datetime | None = Field(default=None, description="Local time of the hospital.")
     station: str = Field(default="", description="The station that it is scheduled for.")
     modality: str = ""
     description: str = Field(default="", description="Of the procedure.")

@@ -30,7 +30,7 @@ from specimap_service.context import AppContext, Context, audit
 from specimap_service.hospital.dependencies import MakingDep
 from specimap_service.paging import After, MaybeLimit, Sort, listed, paged
 
-router = APIRouter(prefix="/v1/clouds/{cloud_id}", tags=["hospital"])
+router = APIRouter(prefix="/v1/clouds/{cloud_id}", tags=["dicom"])
 DeliveryState = Literal["waiting", "sent", "committed", "failed"]
 MOST_BANDS = 32
 ARCHIVE = "dicom.zip"

@@ -12,7 +12,7 @@ from specimap_service.auth.keys import Principal
 from specimap_service.context import AppContext, Context, audit
 from specimap_service.hospital.dependencies import AskingDep
 
-router = APIRouter(prefix="/v1", tags=["hospital"])
+router = APIRouter(prefix="/v1", tags=["orders"])
 
 
 @router.post("/orders/search", operation_id="orders.search")

@@ -22,7 +22,7 @@ from specimap_service.hospital.intake import Intake, Taken
 from specimap_service.hospital.related_parts import boundary_of, split_parts
 from specimap_service.space import check_disks
 
-router = APIRouter(prefix="/v1/dicomweb", tags=["hospital"])
+router = APIRouter(prefix="/v1/dicomweb", tags=["dicom"])
 ANSWER = "application/dicom+json"
 BODY = {
     "requestBody": {

@@ -18,7 +18,7 @@ from specimap_service.auth.dependencies import Uploader
 from specimap_service.auth.object_ids import AcquisitionId
 from specimap_service.context import Context, audit
 
-router = APIRouter(prefix="/v1", tags=["hospital"])
+router = APIRouter(prefix="/v1", tags=["studies"])
 
 
 class Study(BaseModel):
