@@ -23,7 +23,13 @@ Uid = Annotated[str, StringConstraints(max_length=64, pattern=r"^(0|[1-9]\d*)(\.
 class StudyContext(BaseModel):
     """What an order says, or a person entered. Attribute names follow DICOM's keywords."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(
+        extra="forbid",
+        frozen=True,
+        json_schema_extra={
+            "example": {"accession_number": "A-2026-0117", "patient_id": "0000001", "patient_name": "Doe^Jane"}
+        },
+    )
 
     study_instance_uid: Uid | None = Field(default=None, description="The order's own study; without it one is made.")
     accession_number: ShortText = ""

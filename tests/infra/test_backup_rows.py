@@ -57,6 +57,8 @@ def fill(database: Database) -> None:
                     row[column.name] = {"of": [table.name, None, 0.1, "\u00e9"]}
                 elif isinstance(column.type, sa.DateTime):
                     row[column.name] = datetime.datetime(2026, 11, 1, 10, 0, 0, 123456)
+                elif isinstance(column.type, sa.Boolean):
+                    row[column.name] = True
                 elif isinstance(column.type, sa.Integer | sa.Float):
                     row[column.name] = 7
                 elif not column.nullable:

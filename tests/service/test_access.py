@@ -48,7 +48,11 @@ CHAIN = ("seq", "previous_hash", "hash")
 
 @pytest.fixture
 def any_service(any_database: str, tmp_path: Path) -> Iterator[Running]:
-    hospital: dict[str, Any] = {"study_keys": [new_key()], "pacs_url": "http://127.0.0.1:9", "fhir_url": "http://127.0.0.1:9"}
+    hospital: dict[str, Any] = {
+        "study_keys": [new_key()],
+        "pacs_url": "http://127.0.0.1:9",
+        "fhir_url": "http://127.0.0.1:9",
+    }
     with serving(tmp_path / "service", database_url=any_database, **hospital) as running:
         yield running
 

@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from jsonschema import Draft202012Validator
 
 from specimap_core.errors import BackendUnavailableError
 from specimap_infra import jobs
+from specimap_infra.study_keys import new_key
 from specimap_service.auth import dependencies
 from specimap_service.auth.permissions import OPERATIONS
 from specimap_service.contract.description import operations
@@ -30,7 +32,7 @@ from tests.support.job_scene import acquisition, queued_job
 from tests.support.places import ROOT, SUPPORT
 from tests.support.plain_http import NO_TLS
 from tests.support.result_scene import put_result
-from tests.support.service_scene import Running
+from tests.support.service_scene import Running, serving
 
 REFUSED = ["400", "401", "403", "404", "405", "406", "409", "412", "413", "415", "422", "428", "429", "5xx"]
 EXAMPLES = 12
@@ -272,10 +274,18 @@ def test_events_hold_what_the_contract_says(contract: dict[str, Any], service: R
     assert seen == set(types) == {"state", "progress", "log"}
 
 
+@pytest.fixture
+def keyed(tmp_path: Path) -> Iterator[Running]:
+    """A service that keeps study contexts, which without a key it cannot."""
+    with serving(tmp_path / "service", study_keys=[new_key()]) as running:
+        yield running
+
+
 @pytest.mark.slow
 def test_generated_requests_are_answered_as_the_contract_says(
-    service: Running, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    keyed: Running, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    service = keyed
     # Wrong keys and cookies come faster than one address may present them.
     monkeypatch.setattr(dependencies, "FAILURES_PER_MINUTE", 1_000_000)
     result = put_result(service, tmp_path / "result")

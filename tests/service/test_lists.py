@@ -14,7 +14,7 @@ import sqlalchemy as sa
 from specimap_infra import jobs
 from specimap_infra.database import utc_now
 from specimap_infra.ids import new_id
-from specimap_infra.tables import Delivery, Erasure, StoredFile
+from specimap_infra.tables import Delivery, DicomSet, Erasure, StoredFile
 from specimap_service.contract.description import operations
 from tests.support.access_scene import JUDGEMENT
 from tests.support.documented import contract
@@ -58,6 +58,18 @@ def full_lists(service: Running, client: httpx.Client, folder: Path) -> dict[str
     notified = queued_job(service.database, owner, webhook={"url": "http://127.0.0.1:9/", "secret": "0" * 16})
     with service.database.session() as session:
         jobs.request_cancel(session, notified)
+        session.add_all(
+            DicomSet(
+                id=new_id("dcs"),
+                cloud_id=result.cloud_id,
+                options={"bands": [number]},
+                first=False,
+                study_version=1,
+                state="waiting",
+                created_by="key_test",
+            )
+            for number in range(3)
+        )
         session.add_all(Delivery(id=new_id("dlv"), job_id=notified, state="given_up") for _ in range(3))
         session.add_all(
             Erasure(id=new_id("ers"), specimen_hash="0", acquisitions=[], removal={}, state="done", created_by="k")
@@ -78,6 +90,7 @@ def full_lists(service: Running, client: httpx.Client, folder: Path) -> dict[str
         "exports.list": f"{cloud}/exports",
         "shares.list": f"{cloud}/shares",
         "erasures.list": "/v1/erasures",
+        "dicom.list": f"{cloud}/dicom",
     }
 
 

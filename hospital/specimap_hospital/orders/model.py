@@ -19,7 +19,9 @@ Long = Annotated[str, StringConstraints(strip_whitespace=True, max_length=64, pa
 class OrderQuery(BaseModel):
     """What an order is looked up by: at least one of the three."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, json_schema_extra={"example": {"accession_number": "A-2026-0117"}}
+    )
 
     accession_number: Short = Field(default="", description="Of the order.")
     patient_id: Long = Field(default="", description="Of the patient.")

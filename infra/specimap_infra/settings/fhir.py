@@ -30,7 +30,7 @@ class FhirSettings(BaseModel):
 
     @field_validator("fhir_url", "fhir_token_url")
     @classmethod
-    def _web_address(cls, value: str) -> str:
+    def _fhir_address(cls, value: str) -> str:
         if value and not value.startswith(("https://", "http://")):
             raise ValueError("is an address that starts with https:// (or http://)")
         return value.rstrip("/")

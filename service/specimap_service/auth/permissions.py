@@ -93,9 +93,9 @@ OPERATIONS: dict[str, str | None] = {
     "clouds.list": READ,
     "deliveries.create": RUN,
     "deliveries.list": READ,
+    "dicom.create": SEND,
     "dicom.get_archive": STUDY,
     "dicom.list": READ,
-    "dicom.create": SEND,
     # By object: photos need one permission, segmentations another.
     "dicomweb.create": None,
     "erasures.create": ERASE,

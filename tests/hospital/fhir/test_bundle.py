@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
@@ -15,29 +12,13 @@ from specimap_hospital.fhir.elements import Systems
 from specimap_hospital.fhir.errors import PatientMissingError, StructuredReportError
 from specimap_hospital.fhir.structured_report import measurement_groups
 from tests.hospital.fhir.scene import CONTEXT, STUDY, VALUES, report, result
-from tests.support.node import NODE, npm_packages
+from tests.hospital.fhir.validation import validated
 
-VALIDATOR = Path(__file__).parent / "validator"
 SYSTEMS = Systems(accession="urn:example:orders")
 
 
 def resources(bundle: dict[str, Any], kind: str) -> list[dict[str, Any]]:
     return [entry["resource"] for entry in bundle["entry"] if entry["resource"]["resourceType"] == kind]
-
-
-def validated(bundle: dict[str, Any]) -> list[dict[str, Any]]:
-    """What the definitions of R4 say against a bundle and its resources."""
-    npm_packages(VALIDATOR)
-    done = subprocess.run(
-        [NODE, "validate.mjs"], cwd=VALIDATOR, input=json.dumps(bundle), capture_output=True, text=True, check=True
-    )
-    found: list[dict[str, Any]] = json.loads(done.stdout)
-    # Value sets that are open: the guide's own codes are in none of them. A code of a closed one is an error.
-    return [message for message in found if "not found in value set" not in message["message"] or is_error(message)]
-
-
-def is_error(message: dict[str, Any]) -> bool:
-    return bool(message["severity"] != "warning")
 
 
 def test_the_groups_of_a_report_are_read_as_written() -> None:

@@ -16,7 +16,7 @@ from specimap_hospital.process import HospitalProcess
 from specimap_infra.database import utc_now
 from specimap_infra.tables import CloudRow, DicomSet, FhirNotice
 from tests.hospital.fhir.server import FhirServer, fhir_server
-from tests.hospital.fhir.test_bundle import validated
+from tests.hospital.fhir.validation import validated
 from tests.support.hospital_scene import KEY, PATIENT, PLANTED, as_json
 from tests.support.outbox_scene import waiting_cloud
 from tests.support.result_scene import put_result
