@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 from specimap_core import __version__
 from specimap_infra.database import database_seconds
 from specimap_infra.tables import Lease
-from specimap_service.auth.dependencies import Admin
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.context import Context
 
 router = APIRouter(tags=["health"])
@@ -53,6 +53,6 @@ def readyz(context: Context) -> Readiness:
     responses={200: {"content": {"text/plain": {}}}},
     operation_id="health.get_metrics",
 )
-def metrics(context: Context, principal: Admin) -> Response:
+def metrics(context: Context, principal: Permitted) -> Response:
     """Return the metrics in Prometheus' text format."""
     return Response(context.metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")

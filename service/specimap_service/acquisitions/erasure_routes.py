@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from specimap_infra.tables import Acquisition, CloudRow
 from specimap_infra.tables import Erasure as ErasureRow
 from specimap_service.acquisitions.routes import Pseudonym
-from specimap_service.auth.dependencies import Admin
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import Context, correlation_id
 from specimap_service.paging import After, Limit, Page, Sort, page_of, paged
@@ -44,7 +44,7 @@ class ErasureView(BaseModel):
 
 
 @router.post("", status_code=201, operation_id="erasures.create")
-def create_erasure(context: Context, principal: Admin, clouds: CloudsDep, wanted: ErasureRequest) -> ErasureView:
+def create_erasure(context: Context, principal: Permitted, clouds: CloudsDep, wanted: ErasureRequest) -> ErasureView:
     """Erase a specimen: all its acquisitions, of all projects, with files, jobs, results, labels, exports and shares.
 
     This cannot be undone. The answer holds the certificate, which is kept too.
@@ -64,7 +64,7 @@ def create_erasure(context: Context, principal: Admin, clouds: CloudsDep, wanted
 
 @router.get("", operation_id="erasures.list")
 def list_erasures(
-    context: Context, principal: Admin, after: After = None, limit: Limit = 50, sort: Sort = "-created_at"
+    context: Context, principal: Permitted, after: After = None, limit: Limit = 50, sort: Sort = "-created_at"
 ) -> Page[ErasureView]:
     """List the erasures."""
     with context.database.session() as session:

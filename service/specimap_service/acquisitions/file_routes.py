@@ -17,7 +17,7 @@ from specimap_service.acquisitions.intake import forget_part
 from specimap_service.acquisitions.routes import check_idle
 from specimap_service.acquisitions.schemas import File, FileId
 from specimap_service.auth.access import not_found
-from specimap_service.auth.dependencies import Reader, Uploader
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.auth.object_ids import AcquisitionId
 from specimap_service.byte_ranges import ranged_response
 from specimap_service.context import Context, audit
@@ -33,7 +33,7 @@ BYTES: dict[str, Any] = {
 @router.get("/acquisitions/{acquisition_id}/files", operation_id="files.list")
 def list_files(
     context: Context,
-    principal: Reader,
+    principal: Permitted,
     request: Request,
     response: Response,
     acquisition_id: AcquisitionId,
@@ -52,7 +52,7 @@ def list_files(
 
 
 @router.get("/acquisitions/{acquisition_id}/files/{file_id}", operation_id="files.get")
-def get_file(context: Context, principal: Reader, acquisition_id: AcquisitionId, file_id: FileId) -> File:
+def get_file(context: Context, principal: Permitted, acquisition_id: AcquisitionId, file_id: FileId) -> File:
     """Return one file."""
     with context.database.session() as session:
         return File.model_validate(_found(session, acquisition_id, file_id))
@@ -65,7 +65,7 @@ def get_file(context: Context, principal: Reader, acquisition_id: AcquisitionId,
     operation_id="files.get_content",
 )
 def get_content(
-    context: Context, principal: Reader, request: Request, acquisition_id: AcquisitionId, file_id: FileId
+    context: Context, principal: Permitted, request: Request, acquisition_id: AcquisitionId, file_id: FileId
 ) -> Response:
     """Return the file's bytes as they were uploaded; ranges and ETags are supported."""
     with context.database.session() as session:
@@ -75,7 +75,7 @@ def get_content(
 
 
 @router.delete("/acquisitions/{acquisition_id}/files/{file_id}", status_code=204, operation_id="files.delete")
-def delete_file(context: Context, principal: Uploader, acquisition_id: AcquisitionId, file_id: FileId) -> None:
+def delete_file(context: Context, principal: Permitted, acquisition_id: AcquisitionId, file_id: FileId) -> None:
     """Delete a file, to send a better one. Refused while a job works on the acquisition."""
     with context.database.session() as session:
         locked_acquisition(session, acquisition_id)

@@ -12,7 +12,7 @@ from specimap_core.errors import NotFoundError
 from specimap_infra.database import utc_now
 from specimap_infra.tables import LegalHold
 from specimap_service.acquisitions.capacity import locked_acquisition
-from specimap_service.auth.dependencies import Admin
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.auth.object_ids import AcquisitionId
 from specimap_service.context import Context, audit
 
@@ -42,7 +42,7 @@ class Hold(BaseModel):
 
 @router.put("", responses={201: {"model": Hold, "description": "Held from now on"}}, operation_id="holds.put")
 def put_hold(
-    context: Context, principal: Admin, response: Response, acquisition_id: AcquisitionId, wanted: HoldRequest
+    context: Context, principal: Permitted, response: Response, acquisition_id: AcquisitionId, wanted: HoldRequest
 ) -> Hold:
     """Keep an acquisition, its files, jobs, results and labels from being deleted; again, to change the reason."""
     with context.database.session() as session:
@@ -59,7 +59,7 @@ def put_hold(
 
 
 @router.get("", operation_id="holds.get")
-def get_hold(context: Context, principal: Admin, acquisition_id: AcquisitionId) -> Hold:
+def get_hold(context: Context, principal: Permitted, acquisition_id: AcquisitionId) -> Hold:
     """Return the hold of an acquisition."""
     with context.database.session() as session:
         row = session.get(LegalHold, acquisition_id)
@@ -69,7 +69,7 @@ def get_hold(context: Context, principal: Admin, acquisition_id: AcquisitionId) 
 
 
 @router.delete("", status_code=204, operation_id="holds.delete")
-def delete_hold(context: Context, principal: Admin, acquisition_id: AcquisitionId) -> None:
+def delete_hold(context: Context, principal: Permitted, acquisition_id: AcquisitionId) -> None:
     """Release an acquisition: it may be deleted again."""
     with context.database.session() as session:
         locked_acquisition(session, acquisition_id)

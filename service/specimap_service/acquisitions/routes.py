@@ -21,7 +21,7 @@ from specimap_service.acquisitions.capacity import locked_acquisition
 from specimap_service.acquisitions.dependencies import JudgeDep, UnfinishedUploadsDep
 from specimap_service.acquisitions.schemas import FileCounts, counts
 from specimap_service.auth.access import in_sight, load, not_found, project_for_new
-from specimap_service.auth.dependencies import Admin, Reader, Uploader
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.auth.object_ids import AcquisitionId
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import Context, audit
@@ -86,7 +86,7 @@ class AcquisitionView(BaseModel):
 @router.post("/acquisitions", status_code=201, responses=repeated(AcquisitionView), operation_id="acquisitions.create")
 def create_acquisition(
     context: Context,
-    principal: Uploader,
+    principal: Permitted,
     judge: JudgeDep,
     response: Response,
     wanted: AcquisitionRequest,
@@ -120,7 +120,7 @@ def create_acquisition(
 @router.get("/acquisitions", operation_id="acquisitions.list")
 def list_acquisitions(
     context: Context,
-    principal: Reader,
+    principal: Permitted,
     specimen_id: Annotated[str | None, Query(max_length=64, description="Only those of this specimen.")] = None,
     accession_number: Annotated[
         str | None, Query(max_length=64, description="Only those with this accession number.")
@@ -149,7 +149,7 @@ def list_acquisitions(
 
 
 @router.get("/acquisitions/{acquisition_id}", operation_id="acquisitions.get")
-def get_acquisition(context: Context, principal: Reader, acquisition_id: AcquisitionId) -> AcquisitionView:
+def get_acquisition(context: Context, principal: Permitted, acquisition_id: AcquisitionId) -> AcquisitionView:
     """Return one acquisition."""
     with context.database.session() as session:
         row = session.get(Acquisition, acquisition_id)
@@ -161,7 +161,7 @@ def get_acquisition(context: Context, principal: Reader, acquisition_id: Acquisi
 @router.delete("/acquisitions/{acquisition_id}", status_code=204, operation_id="acquisitions.delete")
 def delete_acquisition(
     context: Context,
-    principal: Admin,
+    principal: Permitted,
     uploads: UnfinishedUploadsDep,
     clouds: CloudsDep,
     acquisition_id: AcquisitionId,

@@ -22,7 +22,7 @@ from specimap_service.acquisitions.viewpoint_schemas import (
     Viewpoints,
 )
 from specimap_service.auth.access import not_found
-from specimap_service.auth.dependencies import Reader
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.auth.object_ids import AcquisitionId
 from specimap_service.context import AppContext, Context
 
@@ -37,7 +37,7 @@ Shown = tuple[tuple[tuple[int, int], tuple[Square, ...]], ...]
 
 @router.get("/acquisitions/{acquisition_id}/viewpoints", operation_id="acquisitions.get_viewpoints")
 async def get_viewpoints(
-    context: Context, principal: Reader, placing: PlacingDep, request: Request, acquisition_id: AcquisitionId
+    context: Context, principal: Permitted, placing: PlacingDep, request: Request, acquisition_id: AcquisitionId
 ) -> Viewpoints:
     """Tell from where each accepted photo was taken, as its markers show, and where to stand next."""
     edge_mm, photos = await run_in_threadpool(_photos, context, acquisition_id)

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from specimap_infra.tables import AuditEntry
 from specimap_service.auth.access import in_sight
-from specimap_service.auth.dependencies import Admin
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.context import Context
 from specimap_service.paging import InProject, Limit, Moment, Page, Sort, page_of, paged
 
@@ -48,7 +48,7 @@ class Audited(BaseModel):
 @router.get("/audit", operation_id="audit.list")
 def list_audit(
     context: Context,
-    principal: Admin,
+    principal: Permitted,
     target: Annotated[
         str | None, Query(pattern=r"^[a-z]{2,6}_[0-9a-z]{26}$", description="Only entries about this object.")
     ] = None,

@@ -217,7 +217,3 @@ def check_permission(principal: Principal, permission: str) -> None:
 Permitted = Annotated[Principal, Depends(permitted)]
 """The principal of a request that the table of permissions permits."""
 # Other names of it, which say what a route does; what it takes stands in the table alone.
-Uploader = Permitted
-Reader = Permitted
-Labeller = Permitted
-Admin = Permitted

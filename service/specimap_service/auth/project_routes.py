@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 from specimap_infra.projects import new_project, rename_project
 from specimap_infra.tables import Project as ProjectRow
 from specimap_service.auth.access import in_sight, load
-from specimap_service.auth.dependencies import Admin, Reader
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.auth.object_ids import ProjectId
 from specimap_service.context import Context, audit
 from specimap_service.idempotency import IdempotencyKey, Repeatable, repeated
@@ -45,7 +45,7 @@ class Project(BaseModel):
 @router.post("/projects", status_code=201, responses=repeated(Project), operation_id="projects.create")
 def create_project(
     context: Context,
-    principal: Admin,
+    principal: Permitted,
     response: Response,
     wanted: ProjectRequest,
     idempotency_key: IdempotencyKey = None,
@@ -69,7 +69,7 @@ def create_project(
 @router.get("/projects", operation_id="projects.list")
 def list_projects(
     context: Context,
-    principal: Reader,
+    principal: Permitted,
     request: Request,
     response: Response,
     after: After = None,
@@ -84,14 +84,14 @@ def list_projects(
 
 
 @router.get("/projects/{project_id}", operation_id="projects.get")
-def get_project(context: Context, principal: Reader, project_id: ProjectId) -> Project:
+def get_project(context: Context, principal: Permitted, project_id: ProjectId) -> Project:
     """Return one project."""
     with context.database.session() as session:
         return Project.model_validate(load(session, principal, ProjectRow, project_id))
 
 
 @router.patch("/projects/{project_id}", operation_id="projects.update")
-def change_project(context: Context, principal: Admin, project_id: ProjectId, wanted: ProjectRequest) -> Project:
+def change_project(context: Context, principal: Permitted, project_id: ProjectId, wanted: ProjectRequest) -> Project:
     """Rename a project. Its id, its keys and its objects stay as they are."""
     with context.database.session() as session:
         row = load(session, principal, ProjectRow, project_id)

@@ -14,7 +14,7 @@ from specimap_infra.database import utc_now
 from specimap_infra.tables import ApiKey
 from specimap_service.auth.access import in_sight, load, project_for_new
 from specimap_service.auth.credentials import credential_of, is_secret_of
-from specimap_service.auth.dependencies import Admin, KeyringDep
+from specimap_service.auth.dependencies import KeyringDep, Permitted
 from specimap_service.auth.keys import checked_name, derived_secret, key_text, new_key
 from specimap_service.auth.object_ids import KeyId
 from specimap_service.context import Context, audit
@@ -77,7 +77,7 @@ class NewKey(Key):
 @router.post("/keys", status_code=201, responses=repeated(NewKey), operation_id="keys.create")
 def create_key(
     context: Context,
-    principal: Admin,
+    principal: Permitted,
     request: Request,
     response: Response,
     wanted: KeyRequest,
@@ -126,7 +126,7 @@ def create_key(
 @router.get("/keys", operation_id="keys.list")
 def list_keys(
     context: Context,
-    principal: Admin,
+    principal: Permitted,
     request: Request,
     response: Response,
     project: InProject = None,
@@ -142,7 +142,7 @@ def list_keys(
 
 
 @router.delete("/keys/{key_id}", status_code=204, operation_id="keys.revoke")
-def revoke_key(context: Context, principal: Admin, keyring: KeyringDep, key_id: KeyId) -> None:
+def revoke_key(context: Context, principal: Permitted, keyring: KeyringDep, key_id: KeyId) -> None:
     """Revoke a key; it is refused within two seconds everywhere."""
     with context.database.session() as session:
         row = load(session, principal, ApiKey, key_id)

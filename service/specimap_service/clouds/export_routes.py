@@ -20,7 +20,7 @@ from specimap_infra.labels import current_labels, lock_cloud
 from specimap_infra.pseudonyms import Pseudonyms
 from specimap_infra.queue import EXPORTS, MAKE_EXPORT, enqueue
 from specimap_infra.tables import PRIORITIES
-from specimap_service.auth.dependencies import Reader
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.auth.keys import Principal
 from specimap_service.auth.object_ids import CloudId
 from specimap_service.byte_ranges import REVALIDATED, ranged_response
@@ -54,7 +54,7 @@ class Export(BaseModel):
 )
 def create_export(
     context: Context,
-    principal: Reader,
+    principal: Permitted,
     clouds: CloudsDep,
     response: Response,
     cloud_id: CloudId,
@@ -132,7 +132,7 @@ def _made(
 @router.get("", operation_id="exports.list")
 def list_exports(
     context: Context,
-    principal: Reader,
+    principal: Permitted,
     clouds: CloudsDep,
     request: Request,
     response: Response,
@@ -152,7 +152,9 @@ def list_exports(
 
 
 @router.get("/{format}", operation_id="exports.get")
-def get_export(context: Context, principal: Reader, clouds: CloudsDep, cloud_id: CloudId, format: FileFormat) -> Export:
+def get_export(
+    context: Context, principal: Permitted, clouds: CloudsDep, cloud_id: CloudId, format: FileFormat
+) -> Export:
     """Return the state of a file."""
     cloud = clouds.record(cloud_id)
     return _mesh_ply(context, cloud) if format is FileFormat.MESH_PLY else _view(_found(context, cloud_id, format))
@@ -176,7 +178,7 @@ FILE: dict[int | str, dict[str, Any]] = {
 @router.head("/{format}/content", response_class=Response, responses=FILE, operation_id="exports.head_content")
 @router.get("/{format}/content", response_class=Response, responses=FILE, operation_id="exports.get_content")
 def get_content(
-    context: Context, principal: Reader, clouds: CloudsDep, request: Request, cloud_id: CloudId, format: FileFormat
+    context: Context, principal: Permitted, clouds: CloudsDep, request: Request, cloud_id: CloudId, format: FileFormat
 ) -> Response:
     """Return the file itself; single byte ranges let a broken download continue."""
     cloud = clouds.record(cloud_id)

@@ -27,7 +27,7 @@ from specimap_service.array_responses import (
     json_rows_answer,
     npy_answer,
 )
-from specimap_service.auth.dependencies import Labeller, Reader
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.auth.keys import Principal
 from specimap_service.auth.object_ids import CloudId
 from specimap_service.clouds.dependencies import CloudsDep
@@ -68,7 +68,7 @@ BINARY = {"schema": {"type": "string", "format": "binary"}}
 )
 async def put(
     context: Context,
-    principal: Labeller,
+    principal: Permitted,
     clouds: CloudsDep,
     request: Request,
     response: Response,
@@ -143,7 +143,7 @@ def _append(target: FilePath, data: bytes) -> None:
 @router.get("/clouds/{cloud_id}/labels", operation_id="labels.list")
 def list_labels(
     context: Context,
-    principal: Reader,
+    principal: Permitted,
     clouds: CloudsDep,
     request: Request,
     response: Response,
@@ -163,7 +163,7 @@ def list_labels(
 @router.get("/clouds/{cloud_id}/labels/{name}", operation_id="labels.get")
 def get_label(
     context: Context,
-    principal: Reader,
+    principal: Permitted,
     clouds: CloudsDep,
     response: Response,
     cloud_id: CloudId,
@@ -179,7 +179,7 @@ def get_label(
 @router.get("/clouds/{cloud_id}/labels/{name}/versions", operation_id="labels.list_versions")
 def list_versions(
     context: Context,
-    principal: Reader,
+    principal: Permitted,
     clouds: CloudsDep,
     request: Request,
     response: Response,
@@ -208,7 +208,7 @@ def list_versions(
 )
 def get_values(
     context: Context,
-    principal: Reader,
+    principal: Permitted,
     clouds: CloudsDep,
     request: Request,
     cloud_id: CloudId,
@@ -248,7 +248,7 @@ def get_values(
 @router.delete("/clouds/{cloud_id}/labels/{name}", status_code=204, operation_id="labels.delete")
 def delete(
     context: Context,
-    principal: Labeller,
+    principal: Permitted,
     clouds: CloudsDep,
     cloud_id: CloudId,
     name: LabelName,

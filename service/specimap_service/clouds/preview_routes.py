@@ -14,7 +14,7 @@ from specimap_core import __version__
 from specimap_core.errors import CloudDamagedError, NotFoundError
 from specimap_core.json_text import json_text
 from specimap_infra.tables import LabelVersion
-from specimap_service.auth.dependencies import Reader
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.auth.object_ids import CloudId
 from specimap_service.byte_ranges import VARY, known_to_client, names_tag
 from specimap_service.clouds import drawing
@@ -101,7 +101,9 @@ class Previews:
         return Response(picture.png, headers=headers, media_type="image/png")
 
 
-async def previews_of_request(principal: Reader, request: Request, clouds: CloudsDep, queue: PicturesDep) -> Previews:
+async def previews_of_request(
+    principal: Permitted, request: Request, clouds: CloudsDep, queue: PicturesDep
+) -> Previews:
     """Combine the objects that pictures need: a dependency, ``async`` so that it takes no thread."""
     return Previews(clouds, queue, request, principal.key_id)
 
@@ -111,7 +113,7 @@ PreviewsDep = Annotated[Previews, Depends(previews_of_request)]
 
 @router.get("/rgb.png", response_class=Response, responses=PNG, operation_id="previews.get_rgb")
 async def rgb(
-    principal: Reader,
+    principal: Permitted,
     previews: PreviewsDep,
     cloud_id: CloudId,
     size: Size = 1024,
@@ -123,7 +125,7 @@ async def rgb(
 
 @router.get("/pca.png", response_class=Response, responses=PNG, operation_id="previews.get_pca")
 async def pca(
-    principal: Reader,
+    principal: Permitted,
     previews: PreviewsDep,
     cloud_id: CloudId,
     size: Size = 1024,
@@ -135,7 +137,7 @@ async def pca(
 
 @router.get("/band.png", response_class=Response, responses=PNG, operation_id="previews.get_band")
 async def band(
-    principal: Reader,
+    principal: Permitted,
     previews: PreviewsDep,
     cloud_id: CloudId,
     b: Annotated[str | None, _band("The band")] = None,
@@ -155,7 +157,7 @@ async def band(
 
 @router.get("/composite.png", response_class=Response, responses=PNG, operation_id="previews.get_composite")
 async def composite(
-    principal: Reader,
+    principal: Permitted,
     previews: PreviewsDep,
     cloud_id: CloudId,
     r: Annotated[str, _band("Band shown in red")] = TRUE_COLOUR[0],
@@ -171,7 +173,7 @@ async def composite(
 
 @router.get("/index.png", response_class=Response, responses=PNG, operation_id="previews.get_index")
 async def index(
-    principal: Reader,
+    principal: Permitted,
     previews: PreviewsDep,
     cloud_id: CloudId,
     a: Annotated[str, _band("First band")],
@@ -190,7 +192,7 @@ async def index(
 @router.get("/label.png", response_class=Response, responses=PNG, operation_id="previews.get_label")
 async def label(
     context: Context,
-    principal: Reader,
+    principal: Permitted,
     previews: PreviewsDep,
     cloud_id: CloudId,
     name: Annotated[str, Query(pattern=r"^[a-z0-9_-]{1,64}$", description="The layer.")],

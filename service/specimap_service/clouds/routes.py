@@ -14,7 +14,7 @@ from specimap_core.errors import NotFoundError
 from specimap_core.report.cameras import Cameras
 from specimap_infra.tables import Acquisition, CloudRow, Job
 from specimap_service.auth.access import in_sight
-from specimap_service.auth.dependencies import Reader
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.auth.object_ids import CloudId
 from specimap_service.byte_ranges import ranged_response
 from specimap_service.clouds.dependencies import CloudsDep
@@ -56,7 +56,7 @@ class CloudAnswer(CloudSummary):
 @router.get("/clouds", operation_id="clouds.list")
 def list_clouds(
     context: Context,
-    principal: Reader,
+    principal: Permitted,
     acquisition_id: Annotated[str | None, Query(max_length=64, description="Only those of this acquisition.")] = None,
     specimen_id: Annotated[str | None, Query(max_length=200, description="Only those of this specimen.")] = None,
     project: InProject = None,
@@ -79,7 +79,7 @@ def list_clouds(
 
 
 @router.get("/clouds/{cloud_id}", operation_id="clouds.get")
-def show_cloud(principal: Reader, clouds: CloudsDep, cloud_id: CloudId) -> CloudAnswer:
+def show_cloud(principal: Permitted, clouds: CloudsDep, cloud_id: CloudId) -> CloudAnswer:
     """Return one cloud."""
     with clouds.reading(cloud_id) as (record, cloud):
         boxes, here = cloud.chunk_aabb, f"/v1/clouds/{cloud_id}"
@@ -112,7 +112,7 @@ def show_cloud(principal: Reader, clouds: CloudsDep, cloud_id: CloudId) -> Cloud
     operation_id="clouds.get_corners",
 )
 def get_corners(
-    context: Context, principal: Reader, clouds: CloudsDep, request: Request, cloud_id: CloudId
+    context: Context, principal: Permitted, clouds: CloudsDep, request: Request, cloud_id: CloudId
 ) -> Response:
     """Return the markers' corners: `{"<id>": [[x, y, z] * 4]}`, mm, in the marker frame."""
     record = clouds.record(cloud_id)
@@ -126,7 +126,7 @@ def get_corners(
     operation_id="clouds.get_cameras",
 )
 def get_cameras(
-    context: Context, principal: Reader, clouds: CloudsDep, request: Request, cloud_id: CloudId
+    context: Context, principal: Permitted, clouds: CloudsDep, request: Request, cloud_id: CloudId
 ) -> Response:
     """Return the cameras of the photos and of the cube, in the marker frame, mm."""
     record = clouds.record(cloud_id)

@@ -14,7 +14,7 @@ from specimap_infra import tables
 from specimap_infra.database import utc_now
 from specimap_service.auth.access import load, not_found
 from specimap_service.auth.credentials import credential_of, is_secret_of
-from specimap_service.auth.dependencies import KeyringDep, Uploader, check_permission
+from specimap_service.auth.dependencies import KeyringDep, Permitted, check_permission
 from specimap_service.auth.keys import checked_name, derived_secret
 from specimap_service.auth.object_ids import CloudId, ShareId
 from specimap_service.auth.permissions import READ
@@ -72,7 +72,7 @@ class NewShare(Share):
 @router.post("", status_code=201, responses=repeated(NewShare), operation_id="shares.create")
 def create_share(
     context: Context,
-    principal: Uploader,
+    principal: Permitted,
     request: Request,
     response: Response,
     cloud_id: CloudId,
@@ -122,7 +122,7 @@ def create_share(
 @router.get("", operation_id="shares.list")
 def list_shares(
     context: Context,
-    principal: Uploader,
+    principal: Permitted,
     request: Request,
     response: Response,
     cloud_id: CloudId,
@@ -141,7 +141,7 @@ def list_shares(
 
 @router.delete("/{share_id}", status_code=204, operation_id="shares.revoke")
 def revoke_share(
-    context: Context, principal: Uploader, keyring: KeyringDep, cloud_id: CloudId, share_id: ShareId
+    context: Context, principal: Permitted, keyring: KeyringDep, cloud_id: CloudId, share_id: ShareId
 ) -> None:
     """Revoke a share; whoever came by its link is refused within two seconds everywhere."""
     with context.database.session() as session:

@@ -25,7 +25,7 @@ from specimap_service.array_responses import (
     json_rows_answer,
     npy_answer,
 )
-from specimap_service.auth.dependencies import Reader
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.auth.object_ids import CloudId
 from specimap_service.body_limits import parsed
 from specimap_service.byte_ranges import CACHED, VARY, known_to_client
@@ -64,7 +64,7 @@ Number = Annotated[int, Path(ge=0, lt=2**32)]
 
 @router.get("/clouds/{cloud_id}/points/{index}", response_model=Point, operation_id="spectra.get_point")
 def show_point(
-    principal: Reader, clouds: CloudsDep, cloud_id: CloudId, index: Number, bands: BandList = None
+    principal: Permitted, clouds: CloudsDep, cloud_id: CloudId, index: Number, bands: BandList = None
 ) -> Response:
     """Return one point: position, colour, flags, labels, spectrum."""
     with clouds.reading(cloud_id) as (record, cloud):
@@ -102,7 +102,7 @@ BODY: dict[str, Any] = {
 }
 
 
-async def _wanted(principal: Reader, request: Request, reading: ReadingDep) -> SpectraRequest:
+async def _wanted(principal: Permitted, request: Request, reading: ReadingDep) -> SpectraRequest:
     return await parsed(request, SpectraRequest, reading.parses, principal.key_id)
 
 
@@ -114,7 +114,7 @@ async def _wanted(principal: Reader, request: Request, reading: ReadingDep) -> S
     operation_id="spectra.select",
 )
 async def read_spectra(
-    principal: Reader,
+    principal: Permitted,
     clouds: CloudsDep,
     reading: ReadingDep,
     request: Request,
@@ -183,7 +183,7 @@ def _page_points(limit: int | None, width: int, *, json: bool) -> int:
     operation_id="spectra.get_band",
 )
 async def read_band(
-    principal: Reader,
+    principal: Permitted,
     clouds: CloudsDep,
     copies: BandCopiesDep,
     reading: ReadingDep,

@@ -14,7 +14,7 @@ from specimap_core.cloud.source import ByteSource
 from specimap_core.errors import NotFoundError
 from specimap_core.json_text import json_text
 from specimap_infra.storage import Storage
-from specimap_service.auth.dependencies import Reader
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.auth.object_ids import CloudId
 from specimap_service.byte_ranges import CACHED, REVALIDATED, ranged_bytes, ranged_response
 from specimap_service.clouds.dependencies import CloudsDep
@@ -40,7 +40,7 @@ _ANSWERS: dict[int | str, dict[str, Any]] = {
 @router.get("/clouds/{cloud_id}/zarr/{key:path}", response_class=Response, responses=_ANSWERS, operation_id="zarr.get")
 def zarr_file(
     context: Context,
-    principal: Reader,
+    principal: Permitted,
     clouds: CloudsDep,
     request: Request,
     cloud_id: CloudId,

@@ -22,7 +22,7 @@ from specimap_infra import tables
 from specimap_infra.database import utc_now
 from specimap_infra.errors import ArchiveMissingError
 from specimap_infra.studies import study_keys
-from specimap_service.auth.dependencies import Reader, Uploader
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.auth.keys import Principal
 from specimap_service.auth.object_ids import CloudId
 from specimap_service.clouds.dependencies import CloudsDep
@@ -97,7 +97,7 @@ class DicomSet(BaseModel):
 @router.get("/dicom", operation_id="dicom.list")
 def list_dicom(
     context: Context,
-    principal: Reader,
+    principal: Permitted,
     clouds: CloudsDep,
     request: Request,
     response: Response,
@@ -117,7 +117,7 @@ def list_dicom(
 
 @router.post("/dicom", status_code=202, operation_id="dicom.create")
 def send_dicom(
-    context: Context, principal: Uploader, clouds: CloudsDep, cloud_id: CloudId, wanted: DicomRequest
+    context: Context, principal: Permitted, clouds: CloudsDep, cloud_id: CloudId, wanted: DicomRequest
 ) -> DicomSet:
     """Have DICOM objects of a result made and sent to the archive; asked again, what failed is tried again.
 
@@ -143,7 +143,7 @@ def send_dicom(
     operation_id="dicom.get_archive",
 )
 async def get_archive(
-    context: Context, principal: Uploader, clouds: CloudsDep, making: MakingDep, request: Request, cloud_id: CloudId
+    context: Context, principal: Permitted, clouds: CloudsDep, making: MakingDep, request: Request, cloud_id: CloudId
 ) -> StreamingResponse:
     """Return the first set of DICOM objects as a ZIP with a DICOMDIR, made anew for each request.
 

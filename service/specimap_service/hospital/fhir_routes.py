@@ -17,7 +17,7 @@ from specimap_infra.labels import lock_cloud
 from specimap_infra.studies import study_keys
 from specimap_infra.tables import CloudRow, SealedStudy
 from specimap_infra.tables import FhirNotice as NoticeRow
-from specimap_service.auth.dependencies import Reader, Uploader
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.auth.object_ids import CloudId
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import Context, audit
@@ -41,7 +41,7 @@ class FhirNotice(BaseModel):
 
 
 @router.get("", operation_id="fhir.get")
-def get_notice(context: Context, principal: Reader, clouds: CloudsDep, cloud_id: CloudId) -> FhirNotice:
+def get_notice(context: Context, principal: Permitted, clouds: CloudsDep, cloud_id: CloudId) -> FhirNotice:
     """Return how far the FHIR server has been told of a result."""
     clouds.record(cloud_id)
     with context.database.session() as session:
@@ -55,7 +55,7 @@ def get_notice(context: Context, principal: Reader, clouds: CloudsDep, cloud_id:
 
 
 @router.post("", status_code=202, operation_id="fhir.create")
-def send_notice(context: Context, principal: Uploader, clouds: CloudsDep, cloud_id: CloudId) -> FhirNotice:
+def send_notice(context: Context, principal: Permitted, clouds: CloudsDep, cloud_id: CloudId) -> FhirNotice:
     """Tell the FHIR server of a result, or tell it again: it replaces what it was told before."""
     clouds.record(cloud_id)
     if not context.settings.fhir_url:

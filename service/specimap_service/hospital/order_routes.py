@@ -7,7 +7,7 @@ from fastapi.concurrency import run_in_threadpool
 
 from specimap_hospital.orders.lookup import find_orders
 from specimap_hospital.orders.model import OrderQuery, Orders
-from specimap_service.auth.dependencies import Uploader
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.auth.keys import Principal
 from specimap_service.context import AppContext, Context, audit
 from specimap_service.hospital.dependencies import AskingDep
@@ -17,7 +17,7 @@ router = APIRouter(prefix="/v1", tags=["orders"])
 
 @router.post("/orders/search", operation_id="orders.select")
 async def search_orders(
-    context: Context, principal: Uploader, asking: AskingDep, request: Request, response: Response, wanted: OrderQuery
+    context: Context, principal: Permitted, asking: AskingDep, request: Request, response: Response, wanted: OrderQuery
 ) -> Orders:
     """Look an order up by accession number, patient id or station; PUT its `study` to choose it.
 

@@ -14,7 +14,7 @@ from specimap_core.atomic import disk_errors
 from specimap_core.errors import NotFoundError
 from specimap_hospital.outbox.workspaces import workspace
 from specimap_service.acquisitions.dependencies import IntakeDep, JudgeDep
-from specimap_service.auth.dependencies import Uploader
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import AppContext, Context
 from specimap_service.errors import PayloadTooLargeError, RequestInvalidError
@@ -44,7 +44,7 @@ BODY = {
     operation_id="dicomweb.create",
 )
 async def receive_dicom(
-    context: Context, principal: Uploader, judge: JudgeDep, turns: IntakeDep, clouds: CloudsDep, request: Request
+    context: Context, principal: Permitted, judge: JudgeDep, turns: IntakeDep, clouds: CloudsDep, request: Request
 ) -> JSONResponse:
     """Take DICOM objects in (STOW-RS).
 

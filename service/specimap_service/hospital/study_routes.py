@@ -14,7 +14,7 @@ from specimap_core.errors import NotFoundError
 from specimap_infra.studies import find_study, put_study, study_keys
 from specimap_infra.study_context import StudyContext
 from specimap_infra.tables import SealedStudy
-from specimap_service.auth.dependencies import Uploader
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.auth.object_ids import AcquisitionId
 from specimap_service.context import Context, audit
 
@@ -33,7 +33,7 @@ class Study(BaseModel):
 
 @router.put("/acquisitions/{acquisition_id}/study", operation_id="studies.put")
 def put_study_context(
-    context: Context, principal: Uploader, response: Response, acquisition_id: AcquisitionId, wanted: StudyContext
+    context: Context, principal: Permitted, response: Response, acquisition_id: AcquisitionId, wanted: StudyContext
 ) -> Study:
     """Say which order, patient and specimen an acquisition belongs to; replaces what was said before.
 
@@ -49,7 +49,7 @@ def put_study_context(
 
 @router.get("/acquisitions/{acquisition_id}/study", operation_id="studies.get")
 def get_study_context(
-    context: Context, principal: Uploader, response: Response, acquisition_id: AcquisitionId
+    context: Context, principal: Permitted, response: Response, acquisition_id: AcquisitionId
 ) -> Study:
     """Return the study context. That somebody read it is kept in the audit trail."""
     keys = study_keys(context.settings)
@@ -63,7 +63,7 @@ def get_study_context(
 
 
 @router.delete("/acquisitions/{acquisition_id}/study", status_code=204, operation_id="studies.delete")
-def delete_study_context(context: Context, principal: Uploader, acquisition_id: AcquisitionId) -> None:
+def delete_study_context(context: Context, principal: Permitted, acquisition_id: AcquisitionId) -> None:
     """Remove the study context. What an archive has received stays there."""
     with context.database.session() as session:
         row = session.get(SealedStudy, acquisition_id, with_for_update=True)

@@ -19,7 +19,7 @@ from specimap_infra.notifications import DELIVERIES, tell
 from specimap_infra.tables import FINAL_STATES
 from specimap_infra.webhooks import check_target
 from specimap_service.auth.access import not_found
-from specimap_service.auth.dependencies import Reader, Uploader
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.auth.object_ids import JobId
 from specimap_service.context import Context, audit
 from specimap_service.idempotency import IdempotencyKey, Repeatable, repeated
@@ -45,7 +45,7 @@ class Delivery(BaseModel):
 @router.get("/jobs/{job_id}/deliveries", operation_id="deliveries.list")
 def list_deliveries(
     context: Context,
-    principal: Reader,
+    principal: Permitted,
     request: Request,
     response: Response,
     job_id: JobId,
@@ -66,7 +66,7 @@ def list_deliveries(
     "/jobs/{job_id}/deliveries", status_code=202, responses=repeated(Delivery), operation_id="deliveries.create"
 )
 def create_delivery(
-    context: Context, principal: Uploader, response: Response, job_id: JobId, idempotency_key: IdempotencyKey = None
+    context: Context, principal: Permitted, response: Response, job_id: JobId, idempotency_key: IdempotencyKey = None
 ) -> Delivery:
     """Send a job's webhook again, as a delivery of its own: with the job as it is now, a new id and new attempts."""
 

@@ -10,7 +10,7 @@ from typing import Annotated
 from fastapi import Depends, FastAPI
 
 from specimap_service.app_state import AppState
-from specimap_service.auth.dependencies import Reader
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.context import AppContext
 from specimap_service.feature import Feature
 from specimap_service.jobs.events import JobEvents, Streams
@@ -34,7 +34,7 @@ async def _running(app: FastAPI) -> AsyncIterator[None]:
         await asyncio.to_thread(events.stop)
 
 
-async def _place(principal: Reader, streams: Annotated[Streams, Depends(STREAMS.of_request)]) -> AsyncIterator[None]:
+async def _place(principal: Permitted, streams: Annotated[Streams, Depends(STREAMS.of_request)]) -> AsyncIterator[None]:
     with streams.place(principal.key_id):
         yield
 

@@ -19,7 +19,7 @@ from specimap_infra.job_schemas import JobState, JobView, job_views
 from specimap_infra.jobs import locked, request_cancel
 from specimap_infra.tables import CloudRow, Job, JobEvent
 from specimap_service.auth.access import in_sight
-from specimap_service.auth.dependencies import Admin, Reader, Uploader, trust_of
+from specimap_service.auth.dependencies import Permitted, trust_of
 from specimap_service.auth.object_ids import JobId
 from specimap_service.clouds.dependencies import CloudsDep
 from specimap_service.context import AppContext, Context, audit
@@ -45,7 +45,7 @@ REPEATED = repeated(JobView)
 @router.post("/jobs", status_code=202, responses=REPEATED, operation_id="jobs.create")
 def create_job(
     context: Context,
-    principal: Uploader,
+    principal: Permitted,
     response: Response,
     wanted: JobRequest,
     idempotency_key: IdempotencyKey = None,
@@ -57,7 +57,7 @@ def create_job(
 @router.post("/jobs/{job_id}/rerun", status_code=202, responses=REPEATED, operation_id="jobs.rerun")
 def rerun_job(
     context: Context,
-    principal: Uploader,
+    principal: Permitted,
     response: Response,
     job_id: JobId,
     wanted: RerunRequest | None = None,
@@ -76,7 +76,7 @@ def _answer(response: Response, job: JobView, made: bool) -> JobView:
 @router.get("/jobs", operation_id="jobs.list")
 def list_jobs(
     context: Context,
-    principal: Reader,
+    principal: Permitted,
     acquisition_id: Annotated[
         str | None, Query(pattern=r"^acq_[0-9a-z]{26}$", description="Only jobs on this one.")
     ] = None,
@@ -105,14 +105,14 @@ def list_jobs(
 
 
 @router.get("/jobs/{job_id}", operation_id="jobs.get")
-def get_job(context: Context, principal: Reader, job_id: JobId) -> JobView:
+def get_job(context: Context, principal: Permitted, job_id: JobId) -> JobView:
     """Return a job as it is now."""
     with context.database.session() as session:
         return job_views(session, [found_job(session, job_id)])[0]
 
 
 @router.post("/jobs/{job_id}/cancel", status_code=202, operation_id="jobs.cancel")
-def cancel_job(context: Context, principal: Uploader, job_id: JobId) -> JobView:
+def cancel_job(context: Context, principal: Permitted, job_id: JobId) -> JobView:
     """Cancel a job that waits or runs; results of its finished stages are kept for a rerun."""
     with context.database.session() as session:
         before = locked(session, job_id)
@@ -125,13 +125,13 @@ def cancel_job(context: Context, principal: Uploader, job_id: JobId) -> JobView:
 
 
 @router.delete("/jobs/{job_id}", status_code=204, operation_id="jobs.delete")
-def remove_job(context: Context, principal: Admin, clouds: CloudsDep, job_id: JobId) -> None:
+def remove_job(context: Context, principal: Permitted, clouds: CloudsDep, job_id: JobId) -> None:
     """Delete a job that has ended, with its result."""
     delete_job(context, clouds, principal.key_id, job_id)
 
 
 @router.get("/jobs/{job_id}/report", operation_id="jobs.get_report")
-def get_report(context: Context, principal: Reader, job_id: JobId) -> Report:
+def get_report(context: Context, principal: Permitted, job_id: JobId) -> Report:
     """Return the report on the job's result."""
     with context.database.session() as session:
         job = found_job(session, job_id)
@@ -150,7 +150,7 @@ def get_report(context: Context, principal: Reader, job_id: JobId) -> Report:
 @router.get("/jobs/{job_id}/log", operation_id="jobs.get_log")
 def get_log(
     context: Context,
-    principal: Reader,
+    principal: Permitted,
     job_id: JobId,
     after: AfterSeq = None,
     limit: Limit = 100,
@@ -179,7 +179,7 @@ def get_log(
 )
 async def follow_events(
     context: Context,
-    principal: Reader,
+    principal: Permitted,
     place: StreamPlace,
     events: EventsDep,
     request: Request,

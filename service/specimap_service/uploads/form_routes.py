@@ -19,7 +19,7 @@ from specimap_service.acquisitions.inspection import Arrival
 from specimap_service.acquisitions.intake import clean_name, take_in
 from specimap_service.acquisitions.schemas import File
 from specimap_service.auth.access import not_found
-from specimap_service.auth.dependencies import Uploader
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.auth.keys import Principal
 from specimap_service.auth.object_ids import AcquisitionId
 from specimap_service.context import AppContext, Context
@@ -93,7 +93,7 @@ def _quota_exceeded(left: int) -> QuotaExceededError:
 
 @router.post("/acquisitions/{acquisition_id}/files", status_code=201, openapi_extra=FORM, operation_id="files.create")
 async def add_files(
-    context: Context, principal: Uploader, uploads: UploadsDep, request: Request, acquisition_id: AcquisitionId
+    context: Context, principal: Permitted, uploads: UploadsDep, request: Request, acquisition_id: AcquisitionId
 ) -> list[File]:
     """Send some files in one form: `role` before its files. For large files and shaky networks use /v1/uploads."""
     limits = await asyncio.to_thread(_limits, context, principal, request, acquisition_id)

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from specimap_infra.tables import Upload
 from specimap_service.acquisitions.schemas import File
-from specimap_service.auth.dependencies import Uploader
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.auth.object_ids import UploadId
 from specimap_service.context import Context
 from specimap_service.uploads import tus
@@ -43,7 +43,7 @@ class UploadResult(BaseModel):
 
 
 @router.get("/uploads/{upload_id}/result", operation_id="uploads.get_result")
-async def get_result(request: Request, principal: Uploader, uploads: UploadsDep, upload_id: UploadId) -> UploadResult:
+async def get_result(request: Request, principal: Permitted, uploads: UploadsDep, upload_id: UploadId) -> UploadResult:
     """Return the state of an upload; for a finished one its file, with the judgement and advice on retaking it."""
     upload = await uploads.current(upload_id, principal, request.receive)
     return await run_in_threadpool(_result, uploads, upload)
@@ -63,7 +63,7 @@ def _result(uploads: Uploads, upload: Upload) -> UploadResult:
 
 
 @router.options("/uploads", status_code=204, response_class=Response, operation_id="uploads.get_options")
-def get_abilities(context: Context, principal: Uploader) -> Response:
+def get_abilities(context: Context, principal: Permitted) -> Response:
     """Return what this tus server supports, in the `Tus-…` headers of the answer."""
     settings = context.settings
     headers = {

@@ -14,7 +14,7 @@ from starlette.exceptions import HTTPException
 from tuspyserver import create_tus_router
 
 from specimap_infra.tables import Upload
-from specimap_service.auth.dependencies import Uploader
+from specimap_service.auth.dependencies import Permitted
 from specimap_service.context import CONTEXT, Context
 from specimap_service.errors import RequestInvalidError
 from specimap_service.idempotency import IdempotencyKey
@@ -30,7 +30,7 @@ OCTETS = "application/offset+octet-stream"
 # ---- before the library sees a request ----------------------------------------------------------------
 
 
-async def _check_request(request: Request, principal: Uploader, uploads: UploadsDep) -> None:
+async def _check_request(request: Request, principal: Permitted, uploads: UploadsDep) -> None:
     """Check before the body is read whatever can be checked then; the library checks most of it afterwards."""
     exchange, headers = tus.exchange(), request.headers
     exchange.principal = principal
