@@ -147,7 +147,7 @@ def test_operations_are_named_by_resource_and_verb(contract: dict[str, Any]) -> 
             "put": {"put"},
             "patch": {"update", "append"},
             "delete": {"delete", "revoke"},
-            "post": {"create", "cancel", "rerun", "select"},
+            "post": {"create", "cancel", "receive", "rerun", "search", "select", "send"},
         }
         assert verb in allowed[method], f"{method} {path}: {name}"
     for name in contract["components"]["schemas"]:
