@@ -139,7 +139,7 @@ def send_dicom(
 @router.get(
     "/dicom.zip",
     response_class=Response,
-    responses={200: {"content": {"application/zip": {}}}},
+    responses={200: {"content": {"application/zip": {"schema": {"type": "string", "format": "binary"}}}}},
     operation_id="dicom.get_archive",
 )
 async def get_archive(
