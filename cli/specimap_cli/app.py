@@ -200,12 +200,25 @@ def worker(
 
 
 @app.command()
-def hospital(debug: Debug = False) -> None:
+def hospital(
+    health: Annotated[
+        bool, typer.Option("--health", help="Start nothing: say whether this process is alive on this machine.")
+    ] = False,
+    debug: Debug = False,
+) -> None:
     """Send results to the archive and listen to the DICOM port, until Ctrl-C; `specimap serve` does it by itself."""
+    sound = True
     with reported_errors(progress_listener(), debug):
-        from specimap_cli.serve import run_hospital
+        if health:
+            from specimap_cli.health import say_health_of_hospital
 
-        run_hospital()
+            sound = say_health_of_hospital(typer.echo)
+        else:
+            from specimap_cli.serve import run_hospital
+
+            run_hospital()
+    if not sound:
+        raise typer.Exit(FAILED)
 
 
 @app.command()

@@ -59,7 +59,7 @@ def serve(*, workers: bool, say: Callable[[str], None]) -> None:
         say(f"Listening on {settings.host}: put a TLS proxy in front, since keys travel with every request.")
     supervisors = [
         Supervisor(settings.slots if workers else 0, bury=burier(settings)),
-        Supervisor(1 if settings.has_hospital_process else 0, module=HOSPITAL),
+        Supervisor(1 if workers and settings.has_hospital_process else 0, module=HOSPITAL),
     ]
 
     class Server(uvicorn.Server):

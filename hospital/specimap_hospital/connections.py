@@ -68,8 +68,8 @@ def check_has_work(settings: ServiceSettings) -> None:
     """Raise SettingsError where a process of the hospital's side has nothing to do."""
     if not settings.has_hospital_process:
         raise SettingsError(
-            "There is no archive or FHIR server to send to, and no DICOM port.",
-            advice="Set SPECIMAP_PACS_URL, SPECIMAP_PACS_HOST, SPECIMAP_FHIR_URL or SPECIMAP_DICOM_PORT.",
+            "There is no archive, FHIR server or syslog server to send to, and no DICOM port.",
+            advice="Set SPECIMAP_PACS_URL, _PACS_HOST, _FHIR_URL, _AUDIT_SYSLOG or _DICOM_PORT.",
             setting="pacs_url",
         )
 

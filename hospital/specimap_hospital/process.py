@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import socket
 import threading
 import time
+import uuid
 from collections.abc import Callable
 
 from specimap_core.errors import SpecimapError
@@ -15,6 +18,7 @@ from specimap_hospital.outbox.sender import Sender
 from specimap_hospital.outbox.workspaces import sweep
 from specimap_infra.database import Database, utc_now
 from specimap_infra.errors import DatabaseUnavailableError
+from specimap_infra.heartbeats import Note
 from specimap_infra.logs import logger
 from specimap_infra.settings import ServiceSettings
 from specimap_infra.storage import Storage
@@ -23,6 +27,11 @@ POLL_SECONDS = 2.0
 """How often it looks for what has to be sent."""
 AWAY_SECONDS = 5.0
 SWEEP_SECONDS = 3600.0
+STOP_SECONDS = 10.0
+NOTES = "hospital"
+"""Folder in the scratch folder with the notes of these processes (:mod:`specimap_infra.heartbeats`)."""
+SILENT_SECONDS = 1800.0
+"""Time without a beat from which a process hangs: the making of one set takes at most half of it."""
 
 
 class HospitalProcess:
@@ -36,6 +45,7 @@ class HospitalProcess:
         self._sender = Sender(self._database, self._storage, settings)
         self._stop = threading.Event()
         self._fhir = self._fhir_sender() if settings.fhir_url else None
+        self._forwarder = threading.Thread(target=self._forward, name="audit forwarder", daemon=True)
 
     def stop(self) -> None:
         """End soon: after the object that is being sent."""
@@ -44,10 +54,14 @@ class HospitalProcess:
 
     def run(self) -> None:
         """Work until stopped."""
+        note = Note.leave(self._settings.scratch / NOTES, uuid.uuid4().hex, f"{socket.gethostname()}:{os.getpid()}")
         listener = self._listener()
         swept = -SWEEP_SECONDS
+        if self._settings.audit_syslog:
+            self._forwarder.start()
         try:
             while not self._stop.is_set():
+                note.beat()
                 if time.monotonic() - swept > SWEEP_SECONDS:
                     swept = time.monotonic()
                     self._patiently(lambda: sweep(self._settings.scratch) > 0)
@@ -55,7 +69,21 @@ class HospitalProcess:
                 self._stop.wait(min(waits))
         finally:
             listener()
+            if self._forwarder.is_alive():
+                self._forwarder.join(STOP_SECONDS)
+            note.close()
             self._database.close()
+
+    def _forward(self) -> None:
+        """Forward the audit trail, in a thread of its own: objects take minutes to send."""
+        from specimap_hospital.audit.forwarder import AuditForwarder
+
+        while not self._stop.is_set():
+            try:
+                AuditForwarder(self._database, self._settings).run(self._stop)
+            except Exception as error:
+                logger().error("the audit trail is not forwarded", error=type(error).__name__)
+                self._stop.wait(AWAY_SECONDS)
 
     def _send(self) -> bool:
         if not self._settings.sends_dicom:

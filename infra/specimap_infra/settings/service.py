@@ -86,7 +86,7 @@ class ServiceSettings(
     @property
     def has_hospital_process(self) -> bool:
         """Whether a process of the hospital's side has work."""
-        return self.sends_dicom or bool(self.dicom_port or self.fhir_url)
+        return self.sends_dicom or bool(self.dicom_port or self.fhir_url or self.audit_syslog)
 
     @property
     def private_places(self) -> list[Path]:
