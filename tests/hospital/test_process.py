@@ -42,7 +42,7 @@ def sent(folder: Path) -> int:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("arguments", [("serve", "--no-worker"), ("hospital",)])
+@pytest.mark.parametrize("arguments", [("serve",), ("hospital",)])
 def test_results_are_sent_by_the_service_and_by_the_process_alone(
     archive: RunningOrthanc, tmp_path: Path, arguments: tuple[str, ...]
 ) -> None:
@@ -79,77 +79,3 @@ def test_without_work_it_says_so_and_ends(tmp_path: Path) -> None:
     )
     assert done.returncode == 2
     assert "SPECIMAP_PACS_URL" in done.stderr
-
-
-"""The process of the hospital's side as an operator runs it: its health check, and the audit trail that it forwards."""
-
-from __future__ import annotations
-
-import os
-import signal
-import socket
-import threading
-import time
-from collections.abc import Callable
-from typing import Any
-
-from specimap_infra.migrate import migrate
-
-
-def wait_for(met: Callable[[], bool], seconds: float = 60) -> None:
-    end = time.monotonic() + seconds
-    while not met():
-        assert time.monotonic() < end
-        time.sleep(0.2)
-
-
-def environment(folder: Path, **given: str) -> dict[str, str]:
-    settings = {"SPECIMAP_DATA_DIR": str(folder), "SPECIMAP_MIN_FREE_BYTES": "0", **given}
-    return {**{k: v for k, v in os.environ.items() if not k.startswith("SPECIMAP_")}, **settings}
-
-
-def health(env: dict[str, str]) -> tuple[int, str]:
-    done = subprocess.run(
-        [sys.executable, "-m", "specimap_cli", "hospital", "--health"], env=env, capture_output=True, text=True
-    )
-    return done.returncode, done.stdout + done.stderr
-
-
-def test_the_process_forwards_the_audit_trail_and_its_health_is_told(tmp_path: Path) -> None:
-    database = Database.open(f"sqlite:///{tmp_path / 'specimap.db'}")
-    migrate(database)
-    database.close()
-    heard: list[bytes] = []
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        port = listener.getsockname()[1]
-
-        def listen() -> None:
-            while True:
-                try:
-                    peer, _ = listener.accept()
-                except OSError:
-                    return
-                with peer:
-                    while part := peer.recv(65536):
-                        heard.append(part)
-
-        threading.Thread(target=listen, daemon=True).start()
-        env = environment(tmp_path, SPECIMAP_AUDIT_SYSLOG=f"tcp://127.0.0.1:{port}")
-        assert health(env)[0] != 0
-        made: Any = subprocess.run(
-            [sys.executable, "-m", "specimap_cli", "keys", "create", "--name", "tablet", "--scope", "read"],
-            env=env,
-            capture_output=True,
-            text=True,
-        )
-        assert made.returncode == 0, made.stderr
-        process = subprocess.Popen([sys.executable, "-m", "specimap_cli", "hospital"], env=env, stderr=subprocess.PIPE)
-        try:
-            wait_for(lambda: any(b"key.create" in part or b"key_" in part for part in heard))
-            wait_for(lambda: health(env)[0] == 0)
-            assert "alive here: 1" in health(env)[1]
-        finally:
-            process.send_signal(signal.SIGTERM)
-            _, said = process.communicate(timeout=60)
-        assert process.returncode == 0, said
-        assert health(env)[0] != 0
