@@ -50,14 +50,15 @@ def browser() -> Iterator[Browser]:
         started.close()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def study(browser: Browser, viewer: str) -> Iterator[Page]:
-    """The viewer on the study, once its first photo is drawn."""
+    """The viewer on the study, with its first photo open."""
     page = browser.new_page(viewport=WINDOW)  # type: ignore[arg-type]
     page.set_default_timeout(LOAD_MS)
     page.goto(f"{viewer}/viewer?StudyInstanceUIDs={ORDER.study_instance_uid}")
     page.get_by_text("Skip all").click()
     page.get_by_text("S:7", exact=True).wait_for()
+    page.locator(OVERLAY, has_text="Photos of the specimen").wait_for()
     yield page
     page.close()
 
@@ -85,7 +86,6 @@ def open_series(page: Page, number: int) -> None:
 
 @pytest.mark.slow
 def test_a_photo_is_shown_as_it_is(study: Page, first_set: Built) -> None:
-    study.locator(OVERLAY, has_text="Photos of the specimen").wait_for()
     shown = drawn(study, "dicom-photo")
     photo = first_set.one("photo").pixel_array
     # The photo's own colours fill the middle of the viewport.
@@ -97,11 +97,11 @@ def test_a_photo_is_shown_as_it_is(study: Page, first_set: Built) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("number", "name"), [(2, "Top view with markers"), (3, "Spectral preview")])
-def test_pictures_are_shown(study: Page, number: int, name: str) -> None:
-    open_series(study, number)
-    study.locator(OVERLAY, has_text=name).wait_for()
-    assert drawn(study, f"dicom-series-{number}").std() > 20
+def test_pictures_are_shown(study: Page) -> None:
+    for number, name in ((2, "Top view with markers"), (3, "Spectral preview")):
+        open_series(study, number)
+        study.locator(OVERLAY, has_text=name).wait_for()
+        assert drawn(study, f"dicom-series-{number}").std() > 20
     # No letters of a patient's axes on an excised specimen.
     assert [
         mark.strip() for mark in study.locator('[class*="rientation-marker"]').all_text_contents() if mark.strip()
@@ -113,16 +113,23 @@ def test_the_numbers_are_shown_on_the_top_view(study: Page) -> None:
     open_series(study, 5)
     study.get_by_role("button", name="No", exact=True).click()
     words = study.locator("svg.svg-layer tspan")
-    words.filter(has_text="Stated SD of a point of the specimen, median").first.wait_for(state="attached")
+    for step in range(60):
+        # The viewer loads the report beside the image, and draws it with the next change of the viewport.
+        study.set_viewport_size({"width": WINDOW["width"] + 20 * (step % 2), "height": WINDOW["height"]})
+        study.wait_for_timeout(1000)
+        if words.count():
+            break
     said = [line.rsplit(": ", 1) for line in words.all_text_contents()]
     names = Counter(name for name, _ in said)
     assert names["Corner in the cube, residual"] == 16
     assert names["Error at this marker when it is left out"] == 4
     assert {"2D corner error, mean", "3D corner error, median", "Leaving a marker out, error, median"} <= set(names)
-    # A number and its unit, and not zero for want of digits.
+    # A number and its unit; the viewer shows nothing for a zero, which the residual of a corner may be.
     values = [value.split() for _, value in said]
-    assert {unit for _, unit in values} == {"um"}
-    assert all(float(number) > 0 for number, _ in values)
+    assert {value[-1] for value in values} == {"um"}
+    known = [float(value[0]) for value in values if len(value) == 2]
+    assert len(known) >= 20
+    assert all(number > 0 for number in known)
     shown = drawn(study, "dicom-measurements").astype(int)
     yellow = (shown[..., 0] > 200) & (shown[..., 1] > 200) & (shown[..., 2] < 80)
     assert yellow.sum() > 200
