@@ -57,10 +57,12 @@ def test_the_trail_is_forwarded_and_the_health_of_the_process_is_told(tmp_path: 
     assert "No process of the hospital's side lives here." in said
     status, said = command(tmp_path, "keys", "create", "--name", "tablet", "--scope", "read")
     assert status == 0, said
-    with listening() as (port, heard):
-        with running(tmp_path, "hospital", SPECIMAP_AUDIT_SYSLOG=f"tcp://127.0.0.1:{port}") as program:
-            until(lambda: any(b"key.create" in part or b"key_" in part for part in heard), 60, "a message")
-            until(lambda: command(tmp_path, "hospital", "--health")[0] == 0, 60, "its health")
-            program.process.send_signal(signal.SIGTERM)
-            assert program.process.wait(60) == 0, program.lines
+    with (
+        listening() as (port, heard),
+        running(tmp_path, "hospital", SPECIMAP_AUDIT_SYSLOG=f"tcp://127.0.0.1:{port}") as program,
+    ):
+        until(lambda: any(b"key.create" in part or b"key_" in part for part in heard), 60, "a message")
+        until(lambda: command(tmp_path, "hospital", "--health")[0] == 0, 60, "its health")
+        program.process.send_signal(signal.SIGTERM)
+        assert program.process.wait(60) == 0, program.lines
     assert command(tmp_path, "hospital", "--health")[0] != 0

@@ -28,7 +28,19 @@ router = APIRouter(prefix="/v1/clouds/{cloud_id}/fhir", tags=["fhir"])
 class FhirNotice(BaseModel):
     """How far the FHIR server has been told of a result. It says nothing of the patient."""
 
-    model_config = ConfigDict(from_attributes=True)
+    model_config = ConfigDict(
+        from_attributes=True,
+        json_schema_extra={
+            "example": {
+                "cloud_id": "cloud_01m2v0k3h5q7xg8w9c4e6t1n2b",
+                "state": "sent",
+                "attempts": 1,
+                "next_at": "2026-11-28T10:00:02Z",
+                "error": None,
+                "sent_at": "2026-11-28T10:00:01Z",
+            }
+        },
+    )
 
     cloud_id: str
     state: Literal["pending", "sent", "refused", "given_up"] = Field(
