@@ -66,7 +66,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
         put = client.put(layer(result), content=npy(classes), headers=header())
         assert put.status_code == 201, put.text
         assert client.put(f"/v1/acquisitions/{result.acquisition_id}/study", json=as_json()).status_code == 200
-        objects = {}
+        objects: dict[str, Dataset] = {}
         for number, options in enumerate(({}, {"label": "tissue"})):
             for made in as_sent(running, result, options, folder / f"made-{number}"):
                 objects[made.kind] = dcmread(made.path)
@@ -152,7 +152,8 @@ def values_of(scene: Scene, name: str) -> Array:
         f"/v1/clouds/{scene.result.cloud_id}/labels/{name}/values", headers={"Accept": "application/x-npy"}
     )
     assert answer.status_code == 200, answer.text
-    return np.load(BytesIO(answer.content), allow_pickle=False)
+    values: Array = np.load(BytesIO(answer.content), allow_pickle=False)
+    return values
 
 
 # ---- segmentations ------------------------------------------------------------------------------------
@@ -251,7 +252,7 @@ def deflated() -> bytes:
     from pydicom.filewriter import write_file_meta_info
 
     head.write(b"\0" * 128 + b"DICM")
-    write_file_meta_info(head, meta)
+    write_file_meta_info(head, meta)  # type: ignore[arg-type]
     deflate = zlib.compressobj(9, wbits=-15)
     return head.getvalue() + b"".join(deflate.compress(bytes(1 << 20)) for _ in range(1024)) + deflate.flush()
 

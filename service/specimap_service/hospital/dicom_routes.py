@@ -14,6 +14,7 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 from sqlalchemy.orm import Session
+from starlette.background import BackgroundTask
 
 from specimap_hospital.outbox.making import make_objects
 from specimap_hospital.outbox.rows import request_set
@@ -156,7 +157,9 @@ async def get_archive(
         "Content-Disposition": f'attachment; filename="{cloud_id}-dicom.zip"',
         "Cache-Control": "no-store",
     }
-    return StreamingResponse(_pieces(file), media_type="application/zip", headers=headers)
+    # Closed also where nobody reads it: the answer to HEAD has no body.
+    closing = BackgroundTask(file.close)
+    return StreamingResponse(_pieces(file), media_type="application/zip", headers=headers, background=closing)
 
 
 def _archive(context: AppContext, principal: Principal, cloud_id: str) -> BinaryIO:
