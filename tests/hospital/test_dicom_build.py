@@ -29,6 +29,7 @@ from tests.support.document_scene import folder_of
 from tests.support.photo_files import bomb, pattern, written
 from tests.support.scenes import Finished
 
+pytestmark = pytest.mark.slow
 KINDS = ("top_view", "preview", "mesh", "measurements", "report", "key_objects")
 PLANE = ("FrameOfReferenceUID", "ImageOrientationPatient", "ImagePositionPatient")
 
@@ -70,7 +71,6 @@ def region(group: Dataset) -> np.ndarray[Any, np.dtype[np.float64]]:
 # ---- what is in it ------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_it_holds_each_photo_and_one_object_of_each_other_kind(first_set: Built) -> None:
     assert Counter(made.kind for made in first_set.objects) == {"photo": 24, **dict.fromkeys(KINDS, 1)}
     assert len({made.sop_instance_uid for made in first_set.objects}) == 30
@@ -84,7 +84,6 @@ def test_it_holds_each_photo_and_one_object_of_each_other_kind(first_set: Built)
         assert made.sop_instance_uid.startswith("2.25.")
 
 
-@pytest.mark.slow
 def test_every_object_is_the_orders_and_says_research(first_set: Built) -> None:
     for made in first_set.objects:
         dataset = dcmread(made.path, stop_before_pixels=True)
@@ -102,7 +101,6 @@ def test_every_object_is_the_orders_and_says_research(first_set: Built) -> None:
         assert requested[0].RequestedProcedureID == "RP-7"
 
 
-@pytest.mark.slow
 def test_every_image_has_the_specimen(first_set: Built) -> None:
     for made in [*first_set.of("photo"), *first_set.of("top_view"), *first_set.of("preview")]:
         dataset = dcmread(made.path, stop_before_pixels=True)
@@ -113,7 +111,6 @@ def test_every_image_has_the_specimen(first_set: Built) -> None:
         assert specimen.IssuerOfTheSpecimenIdentifierSequence[0].LocalNamespaceEntityID == "LAB"
 
 
-@pytest.mark.slow
 def test_an_empty_context_leaves_the_patient_open_and_names_the_specimen(unnamed_set: Built, first_set: Built) -> None:
     studies = set()
     for made in unnamed_set.objects:
@@ -131,7 +128,6 @@ def test_an_empty_context_leaves_the_patient_open_and_names_the_specimen(unnamed
     assert not uids[0] & uids[1]
 
 
-@pytest.mark.slow
 def test_top_view_and_preview_are_one_grid_in_mm_without_a_plane(first_set: Built, sample_run: Finished) -> None:
     top, preview = first_set.one("top_view"), first_set.one("preview")
     assert (top.Rows, top.Columns) == (preview.Rows, preview.Columns)
@@ -145,7 +141,6 @@ def test_top_view_and_preview_are_one_grid_in_mm_without_a_plane(first_set: Buil
     assert np.abs(np.median(top.pixel_array[top.pixel_array.any(2)], 0) - np.median(cloud.rgb, 0)).max() < 20
 
 
-@pytest.mark.slow
 def test_the_surface_is_the_mesh_in_mm(first_set: Built, sample_run: Finished) -> None:
     surface = first_set.one("mesh")
     assert surface.MeasurementUnitsCodeSequence[0].CodeValue == "mm"
@@ -158,7 +153,6 @@ def test_the_surface_is_the_mesh_in_mm(first_set: Built, sample_run: Finished) -
     np.testing.assert_array_equal(corners.reshape(-1, 3).min(0), mesh.vertices[np.unique(mesh.triangles)].min(0))
 
 
-@pytest.mark.slow
 def test_the_report_is_its_pdf(first_set: Built) -> None:
     report = first_set.one("report")
     assert report.MIMETypeOfEncapsulatedDocument == "application/pdf"
@@ -166,7 +160,6 @@ def test_the_report_is_its_pdf(first_set: Built) -> None:
     assert b"%%EOF" in bytes(report.EncapsulatedDocument)[-20:]
 
 
-@pytest.mark.slow
 def test_every_number_of_the_report_is_in_a_region(first_set: Built, sample_run: Finished) -> None:
     report, figures = first_set.one("measurements"), sample_run.report
     found = groups(report)
@@ -189,7 +182,6 @@ def test_every_number_of_the_report_is_in_a_region(first_set: Built, sample_run:
         )
 
 
-@pytest.mark.slow
 def test_regions_lie_on_the_markers_of_the_top_view(first_set: Built, sample_run: Finished) -> None:
     found, top = groups(first_set.one("measurements")), first_set.one("top_view")
     grey = top.pixel_array.mean(2)
@@ -207,7 +199,6 @@ def test_regions_lie_on_the_markers_of_the_top_view(first_set: Built, sample_run
         np.testing.assert_allclose(sides, expected, atol=1e-3)
 
 
-@pytest.mark.slow
 def test_the_report_names_specimen_program_and_its_limits(first_set: Built, sample_run: Finished) -> None:
     report = first_set.one("measurements")
     said = texts(report)
