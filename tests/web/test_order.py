@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from playwright.sync_api import expect
 
@@ -17,7 +18,11 @@ def test_an_order_is_chosen_or_entered(window: Window, tmp_path: Path) -> None:
     write_entry(tmp_path / "entries", "ACC1")
     options = {"Worklists": {"Enable": True, "Database": str(tmp_path / "entries")}}
     with orthanc(tmp_path / "orthanc", options=options) as worklist:
-        place = {"worklist_host": "127.0.0.1", "worklist_port": worklist.dicom_port, "worklist_ae_title": worklist.aet}
+        place: dict[str, Any] = {
+            "worklist_host": "127.0.0.1",
+            "worklist_port": worklist.dicom_port,
+            "worklist_ae_title": worklist.aet,
+        }
         with serving(tmp_path / "service", study_keys=[KEY], **place) as service:
             page = window.page
             window.sign_in(service.url, service.key())
