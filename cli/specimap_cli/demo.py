@@ -98,13 +98,19 @@ def _run(
     listener.report(report)
     out.mkdir(parents=True, exist_ok=True)
     text = report.model_dump_json(indent=1).encode()
-    for name, data in (("report.json", text), ("preview.png", cloud.preview("pca"))):
+    documents = {
+        "report.json": text,
+        "preview.png": cloud.preview("pca"),
+        "corners.json": cloud.corners(),
+        "cameras.json": cloud.cameras(),
+    }
+    for name, data in documents.items():
         with atomic_path(out / name) as aside:
             aside.write_bytes(data)
     cloud.export("mesh-ply", out / "mesh.ply")
     remove(out / "cloud.zarr")
     cloud.download(out / "cloud.zarr")
-    for name in ("cloud.zarr", "mesh.ply", "preview.png", "report.json"):
+    for name in ("cloud.zarr", "mesh.ply", *sorted(documents)):
         say(f"{name:<12} {out / name}")
     return cloud
 

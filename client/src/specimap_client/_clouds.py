@@ -200,6 +200,14 @@ class Cloud:
 
         return fetch_zarr(self._session, self.id, place, heard)
 
+    def corners(self) -> bytes:
+        """The marker corners, ``{"<id>": [[x, y, z] * 4]}`` in mm, as JSON."""
+        return self._session.request("GET", path("clouds", self.id, "corners")).content
+
+    def cameras(self) -> bytes:
+        """Poses and lenses of the photos and of the cube, as JSON. Raises NotFound for results of early versions."""
+        return self._session.request("GET", path("clouds", self.id, "cameras")).content
+
     def preview(self, kind: str = "rgb", **parameters: Any) -> bytes:
         """A PNG picture, ``size`` pixels at its longer side.
 

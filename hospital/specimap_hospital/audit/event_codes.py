@@ -72,7 +72,13 @@ _FIRST = {
     "file": (IMPORT, ()),
     "order": (ORDER_RECORD, ()),
     "orders": (ORDER_RECORD, ()),
-    "context": (PATIENT_RECORD, ()),
+    "study": (PATIENT_RECORD, ()),
+    "studies": (PATIENT_RECORD, ()),
+    "holds": (SECURITY_ALERT, (OBJECT_SECURITY,)),
+    "projects": (SECURITY_ALERT, (SECURITY_CONFIGURATION,)),
+    "erasures": (STUDY_DELETED, ()),
+    "dicomweb": (IMPORT, ()),
+    "fhir": (EXPORT, ()),
     "dicom": (INSTANCES_TRANSFERRED, ()),
     "delivery": (INSTANCES_TRANSFERRED, ()),
 }
@@ -92,7 +98,7 @@ def event_of(action: str, status: int | None = None) -> Event:
     if action in _EXACT:
         return _EXACT[action]
     first, _, verb = action.partition(".")
-    if verb == "list" and first != "audit":
+    if (verb == "list" and first != "audit") or action in ("order.search", "orders.select"):
         return Event(QUERY, "E")
     code, types = _FIRST.get(first, (INSTANCES_ACCESSED, ()))
     if action.startswith(("files.", "exports.")) and verb.startswith("get"):

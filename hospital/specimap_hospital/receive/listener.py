@@ -36,13 +36,17 @@ def start_listener(database: Database, settings: ServiceSettings) -> Callable[[]
     Raises:
         SettingsError: the certificate does not read.
     """
+    titles = [title for title in (*settings.dicom_peers, settings.pacs_ae_title) if title]
+    if not titles:
+        # An empty list would let everybody in.
+        logger().warning("dicom port stays closed: no title may use it", port=settings.dicom_port)
+        return lambda: None
     ae = entity(settings, IDLE_SECONDS)
     from pynetdicom import evt
 
     ae.maximum_associations = MOST_ASSOCIATIONS
     ae.require_called_aet = True
-    # An empty list would let everybody in.
-    ae.require_calling_aet = [title for title in (*settings.dicom_peers, settings.pacs_ae_title) if title] or ["\0"]
+    ae.require_calling_aet = titles
     ae.add_supported_context(VERIFICATION)
     if settings.dicom_key:
         for sop_class in SEGMENTATIONS:

@@ -118,13 +118,14 @@ def list_dicom(
 
 @router.post("/dicom", status_code=202, operation_id="dicom.create")
 def send_dicom(
-    context: Context, principal: Permitted, clouds: CloudsDep, cloud_id: CloudId, wanted: DicomRequest
+    context: Context, principal: Permitted, clouds: CloudsDep, cloud_id: CloudId, wanted: DicomRequest | None = None
 ) -> DicomSet:
     """Have DICOM objects of a result made and sent to the archive; asked again, what failed is tried again.
 
     The acquisition needs a study context. Where the archive has an object of the same UID, the new one takes its place.
     """
     clouds.record(cloud_id)
+    wanted = wanted or DicomRequest()  # type: ignore[call-arg]
     if not context.settings.sends_dicom:
         raise ArchiveMissingError(
             "No archive to send to is set.", advice="Ask whoever runs the service to set SPECIMAP_PACS_URL."
