@@ -14,7 +14,7 @@ from specimap_infra.errors import StudyKeysMissingError, StudySealedError
 from specimap_infra.settings import ServiceSettings
 from specimap_infra.study_context import StudyContext
 from specimap_infra.study_keys import KeyMissingError, SealError, StudyKeys
-from specimap_infra.tables import Acquisition, SealedStudy
+from specimap_infra.tables import Acquisition, CloudRow, DicomSet, FhirNotice, SealedStudy
 
 BATCH = 200
 
@@ -50,13 +50,21 @@ def put_study(session: Session, keys: StudyKeys, acquisition_id: str, context: S
         return row
     key_id, sealed = keys.seal(context.model_dump_json().encode(), acquisition_id)
     if row is None:
-        row = SealedStudy(acquisition_id=acquisition_id, version=1)
+        row = SealedStudy(acquisition_id=acquisition_id, version=_last_version(session, acquisition_id) + 1)
         session.add(row)
     else:
         row.version += 1
     row.key_id, row.sealed, row.updated_at, row.updated_by = key_id, sealed, utc_now(), by
     session.flush()
     return row
+
+
+def _last_version(session: Session, acquisition_id: str) -> int:
+    """The highest version that something was sent with: one that was removed and entered again is another one."""
+    mine = sa.select(CloudRow.id).where(CloudRow.acquisition_id == acquisition_id)
+    sent = session.scalar(sa.select(sa.func.max(DicomSet.study_version)).where(DicomSet.cloud_id.in_(mine)))
+    told = session.scalar(sa.select(sa.func.max(FhirNotice.study_version)).where(FhirNotice.cloud_id.in_(mine)))
+    return max(sent or 0, told or 0)
 
 
 def find_study(session: Session, keys: StudyKeys, acquisition_id: str) -> Study | None:

@@ -140,7 +140,7 @@ def test_studies_of_an_archive_are_orders_too(archive: RunningOrthanc, tmp_path:
 
 @pytest.mark.parametrize("query", [{}, {"patient_id": "*"}, {"accession_number": "A?"}, {"station": "A\\B"}])
 def test_a_query_asks_for_something_and_not_for_all(worklist: RunningOrthanc, tmp_path: Path, query: Any) -> None:
-    with serving(tmp_path / "service", worklist_host="127.0.0.1") as running:
+    with serving(tmp_path / "service", worklist_host="127.0.0.1", worklist_ae_title="RIS") as running:
         answer = running.client().post("/v1/orders/search", json=query)
         assert (answer.status_code, answer.json()["code"]) == (422, "request_invalid")
 
@@ -150,7 +150,8 @@ def test_without_a_source_and_with_one_that_is_away(tmp_path: Path, caplog: pyte
         answer = running.client().post("/v1/orders/search", json={"patient_id": "P-0815"})
         assert (answer.status_code, answer.json()["code"]) == (409, "order_source_missing")
     caplog.set_level(logging.DEBUG)
-    for given in ({"worklist_host": "127.0.0.1", "worklist_port": 9}, {"orders_url": "http://127.0.0.1:9/dicom-web"}):
+    worklist = {"worklist_host": "127.0.0.1", "worklist_port": 9, "worklist_ae_title": "RIS"}
+    for given in (worklist, {"orders_url": "http://127.0.0.1:9/dicom-web"}):
         settings = with_settings(None, data_dir=tmp_path, **given)
         with pytest.raises(OrderSourceUnavailableError) as caught:
             find_orders(settings, OrderQuery(patient_id="P-0815"))
@@ -165,7 +166,7 @@ def test_a_source_that_does_not_answer_is_not_waited_for_long(tmp_path: Path) ->
         threading.Thread(target=lambda: held.extend(silent.accept()[0] for _ in range(2)), daemon=True).start()
         port = silent.getsockname()[1]
         for given in (
-            {"worklist_host": "127.0.0.1", "worklist_port": port},
+            {"worklist_host": "127.0.0.1", "worklist_port": port, "worklist_ae_title": "RIS"},
             {"orders_url": f"http://127.0.0.1:{port}/dicom-web"},
         ):
             settings = with_settings(None, data_dir=tmp_path, orders_seconds=1.0, **given)

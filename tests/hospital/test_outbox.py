@@ -322,7 +322,7 @@ def test_settings_say_whether_there_is_work(tmp_path: Path) -> None:
 
     assert not has()
     assert has(pacs_url="https://pacs.example/dicom-web")
-    assert has(pacs_host="pacs.example")
+    assert has(pacs_host="pacs.example", pacs_ae_title="PACS")
     assert has(dicom_port=11112)
 
 

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -231,3 +232,22 @@ def test_all_variables_that_pages_and_images_name_exist() -> None:
     for file in files:
         for name in re.findall(r"\bSPECIMAP_[A-Z][A-Z0-9_]*\b", file.read_text("utf-8")):
             assert name in known or name == "SPECIMAP_NAME", f"{file.name} names {name}"
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        ({"pacs_host": "pacs.example"}, "SPECIMAP_PACS_HOST"),
+        ({"pacs_password": "secret"}, "SPECIMAP_PACS_PASSWORD"),
+        ({"pacs_token": "a", "pacs_user": "b", "pacs_password": "c"}, "SPECIMAP_PACS_USER"),
+        ({"worklist_host": "ris.example"}, "SPECIMAP_WORKLIST_HOST"),
+        ({"fhir_token_url": "https://fhir.example/token"}, "SPECIMAP_FHIR_TOKEN_URL"),
+        ({"hospital_ca_file": "/nowhere/ca.pem"}, "SPECIMAP_HOSPITAL_CA_FILE"),
+        ({"dicom_port": 11112, "dicom_tls": "on"}, "SPECIMAP_DICOM_TLS"),
+    ],
+)
+def test_settings_that_need_others_are_refused_without_them(given: dict[str, Any], named: str) -> None:
+    with pytest.raises(SettingsError) as caught:
+        load_settings(**given)
+    assert named in caught.value.message
+    assert "secret" not in str(caught.value.as_dict())

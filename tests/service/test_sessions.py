@@ -102,7 +102,7 @@ def test_a_person_signs_in_looks_and_signs_out(any_service: Running) -> None:
         "projects": [{"id": DEFAULT_PROJECT, "name": "default"}],
         "scopes": ["upload", "read"],
         "roles": [],
-        "permissions": ["capture.write", "job.run", "result.read", "share.manage"],
+        "permissions": ["capture.write", "job.run", "result.read", "result.send", "share.manage", "study.manage"],
         "cloud_id": None,
     }
     cookie = cookie_of(answer)

@@ -82,7 +82,8 @@ def _first(found: Dataset | None, keyword: str) -> Dataset | None:
 def _text(found: Dataset | None, keyword: str) -> str:
     value = None if found is None else found.get(keyword)
     if isinstance(value, (list, tuple)) or type(value).__name__ == "MultiValue":
-        value = value[0] if value else None
+        # Of several values none is known to be the right one; a backslash is in no value of a study context.
+        value = "\\".join(str(item) for item in value or ())
     return "" if value is None else str(value).strip(" \0")
 
 

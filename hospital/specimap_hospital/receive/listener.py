@@ -22,8 +22,9 @@ from specimap_infra.logs import logger
 from specimap_infra.settings import ServiceSettings
 
 VERIFICATION = "1.2.840.10008.1.1"
-MOST_ASSOCIATIONS = 8
+MOST_ASSOCIATIONS = 64
 IDLE_SECONDS = 30.0
+GREETING_SECONDS = 5.0
 RETRY_SECONDS = 5.0
 FAILED = 0x0110
 SUCCESS = 0x0000
@@ -45,6 +46,8 @@ def start_listener(database: Database, settings: ServiceSettings) -> Callable[[]
     from pynetdicom import evt
 
     ae.maximum_associations = MOST_ASSOCIATIONS
+    # Who connects says soon what for: silent connections take the places of others.
+    ae.acse_timeout = GREETING_SECONDS
     ae.require_called_aet = True
     ae.require_calling_aet = titles
     ae.add_supported_context(VERIFICATION)
@@ -60,6 +63,7 @@ def start_listener(database: Database, settings: ServiceSettings) -> Callable[[]
         (evt.EVT_C_STORE, lambda event: _taken(settings, event)),
         (evt.EVT_PDU_RECV, lambda event: _bound(settings, event)),
         (evt.EVT_DIMSE_RECV, lambda event: setattr(event.assoc, _COUNTED, 0)),
+        (evt.EVT_REJECTED, lambda event: logger().warning("dicom peer rejected", port=settings.dicom_port)),
         (evt.EVT_N_EVENT_REPORT, lambda event: (_report(database, event), None)),
     ]
     context = _server_tls(settings)

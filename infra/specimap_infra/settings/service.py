@@ -15,6 +15,7 @@ from specimap_infra.settings.fhir import FhirSettings
 from specimap_infra.settings.hospital import HospitalSettings
 from specimap_infra.settings.identity import IdentitySettings
 from specimap_infra.settings.logging import LogSettings
+from specimap_infra.settings.pairs import check_pairs
 from specimap_infra.settings.places import PlaceSettings
 from specimap_infra.settings.privacy import PrivacySettings
 from specimap_infra.settings.retention import RetentionSettings
@@ -125,7 +126,7 @@ def load_settings(**given: object) -> ServiceSettings:
         )
     backends_from(os.environ)
     try:
-        return ServiceSettings(**given)  # type: ignore[arg-type]
+        settings = ServiceSettings(**given)  # type: ignore[arg-type]
     except ValidationError as error:
         first = error.errors()[0]
         name = "_".join(str(part) for part in first["loc"][:1]) or "settings"
@@ -138,6 +139,8 @@ def load_settings(**given: object) -> ServiceSettings:
         raise SettingsError(
             f"The settings do not read: {error}.", advice="docs/settings.md lists the settings and what they take."
         ) from error
+    check_pairs(settings)
+    return settings
 
 
 OTHER_VARIABLES = frozenset(

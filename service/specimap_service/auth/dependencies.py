@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from specimap_service.auth.oidc.identity import Identity
 
 SESSION = "/v1/session"
+NOT_SHARED = ("shares", "dicom", "dicom.zip", "fhir")
+"""Parts of a result that its shares do not show: who else has a link to it, and what the hospital has of it."""
 FAILURES_PER_MINUTE = 60
 """Wrong keys that one address may present a minute before it has to wait."""
 KEYRING = AppState[Keyring]("keyring")
@@ -92,7 +94,7 @@ def check_shared(principal: Principal, method: str, path: str) -> None:
     cloud = f"/v1/clouds/{principal.cloud_id}"
     own = path == cloud or path.startswith(f"{cloud}/")
     reads = method in ("GET", "HEAD") or (method, path) == ("POST", f"{cloud}/spectra")
-    if not (own and reads) or path == f"{cloud}/shares" or path.startswith(f"{cloud}/shares/"):
+    if not (own and reads) or path.removeprefix(f"{cloud}/").partition("/")[0] in NOT_SHARED:
         raise ForbiddenError(
             "The link shows one result and nothing else.",
             advice="Sign in with a key for more.",

@@ -121,7 +121,8 @@ OWN: dict[str, tuple[Refusal, ...]] = {
     "spectra.get_point": _CLOUD,
     "spectra.select": (*_ARRAYS, *_TURNS),
     "studies.get": (infra.StudyKeysMissingError, infra.StudySealedError),
-    "studies.put": (infra.StudyKeysMissingError, infra.StudySealedError),
+    "studies.delete": (infra.LegalHoldError,),
+    "studies.put": (infra.LegalHoldError, infra.StudyKeysMissingError, infra.StudySealedError),
     "sso.get_start": (service.SignInUnknownError, service.CrossSiteRequestError, service.RateLimitedError),
     "sso.get_callback": (service.SignInUnknownError, service.RateLimitedError),
     "uploads.create": (

@@ -36,7 +36,6 @@ class FhirNotice(BaseModel):
                 "state": "sent",
                 "attempts": 1,
                 "next_at": "2026-11-28T10:00:02Z",
-                "error": None,
                 "sent_at": "2026-11-28T10:00:01Z",
             }
         },
@@ -48,8 +47,8 @@ class FhirNotice(BaseModel):
     )
     attempts: int
     next_at: datetime.datetime = Field(description="While it is pending: when the next attempt is due.")
-    error: dict[str, Any] | None = Field(description="Why the last attempt failed: code, message, advice, details.")
-    sent_at: datetime.datetime | None
+    error: dict[str, Any] | None = Field(None, description="Of the last attempt: code, message, advice, details.")
+    sent_at: datetime.datetime | None = None
 
 
 @router.get("", operation_id="fhir.get")

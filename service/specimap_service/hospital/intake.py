@@ -30,7 +30,7 @@ from specimap_infra.database import utc_now
 from specimap_infra.errors import DatabaseUnavailableError, StorageUnavailableError
 from specimap_infra.ids import new_id
 from specimap_infra.logs import logger
-from specimap_infra.studies import put_study
+from specimap_infra.studies import find_study, put_study
 from specimap_infra.study_context import StudyContext
 from specimap_infra.study_keys import StudyKeys
 from specimap_infra.tables import Acquisition, CloudRow, DicomInstance, DicomSet, ReceivedStudy, SealedStudy
@@ -141,6 +141,9 @@ class Intake:
         # In which of several projects an acquisition belongs, an object does not say.
         if not self.principal.may(CAPTURE) or len(self.principal.project_ids) != 1:
             raise UnreadableError(NOT_AUTHORISED)
+        # Photos are put together by their study, and say whose they are: neither may be open.
+        if not found["study_uid"] or found["study"] is None:
+            raise UnreadableError(CANNOT_UNDERSTAND)
         photo = folder / Path(str(found["file"])).name
         content = photo.read_bytes()
         if len(content) > self.context.settings.max_photo_bytes:
@@ -173,11 +176,19 @@ class Intake:
                 with self.context.database.session() as session:
                     known = session.get(ReceivedStudy, digest)
                     if known is not None:
+                        self._check_patient(session, known.acquisition_id, study)
                         return known.acquisition_id
                     return self._new_acquisition(session, digest, study)
             except IntegrityError:
                 continue  # another one of the same study came first
         raise NotFoundError("The acquisition is gone.", advice="Send the object again.")
+
+    def _check_patient(self, session: Session, acquisition_id: str, study: dict[str, Any] | None) -> None:
+        """Raise UnreadableError where a study's photo names another patient than those before it."""
+        keys = StudyKeys.of(self.context.settings.study_keys)
+        known = find_study(session, keys, acquisition_id) if keys else None
+        if known is not None and study is not None and study.get("patient_id") != known.context.patient_id:
+            raise UnreadableError(CANNOT_PROCESS)
 
     def _new_acquisition(self, session: Session, digest: str, study: dict[str, Any] | None) -> str:
         row = Acquisition(

@@ -11,6 +11,7 @@ from fastapi import APIRouter, Response
 from pydantic import BaseModel, Field
 
 from specimap_core.errors import NotFoundError
+from specimap_infra.deletion import check_not_held
 from specimap_infra.studies import find_study, put_study, study_keys
 from specimap_infra.study_context import StudyContext
 from specimap_infra.tables import SealedStudy
@@ -42,6 +43,9 @@ def put_study_context(
     keys = study_keys(context.settings)
     response.headers["Cache-Control"] = "no-store"
     with context.database.session() as session:
+        found = find_study(session, keys, acquisition_id)
+        if found is not None and found.context != wanted:
+            check_not_held(session, acquisition_id)
         row = put_study(session, keys, acquisition_id, wanted, principal.key_id)
         audit(session, principal.key_id, "study.put", acquisition_id, version=row.version)
         return _view(row, wanted)
@@ -69,6 +73,7 @@ def delete_study_context(context: Context, principal: Permitted, acquisition_id:
         row = session.get(SealedStudy, acquisition_id, with_for_update=True)
         if row is None:
             raise _no_study(acquisition_id)
+        check_not_held(session, acquisition_id)
         session.delete(row)
         audit(session, principal.key_id, "study.delete", acquisition_id)
 

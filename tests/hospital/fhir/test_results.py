@@ -79,9 +79,11 @@ def test_a_result_with_a_study_context_is_told(server: FhirServer, tmp_path: Pat
     assert report["subject"]["identifier"]["value"] == PATIENT.patient_id
     assert report["basedOn"][0]["identifier"]["value"] == PATIENT.accession_number
     assert report["presentedForm"][0]["url"] == f"https://specimap.example/#/view/{result.cloud_id}"
-    values = [item["valueQuantity"]["value"] for item in server.store["Observation"] if "valueQuantity" in item]
-    for figure in (figures["corner_2d_mm"]["mean"], figures["corner_3d_mm"]["median"], figures["sigma_mm"]["median"]):
-        assert any(value == pytest.approx(figure, rel=1e-4) for value in values), figure
+    quantities = [item["valueQuantity"] for item in server.store["Observation"] if "valueQuantity" in item]
+    per_mm = {"mm": 1, "um": 1000}
+    values_mm = [item["value"] / per_mm[item["code"]] for item in quantities if item["code"] in per_mm]
+    for figure in (figures["corner_2d_mm"]["mean"], figures["corner_3d_mm"]["median"]):
+        assert any(value == pytest.approx(figure, rel=1e-4) for value in values_mm), figure
     assert validated(server.bundles[-1]) == []
 
 
