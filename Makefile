@@ -18,7 +18,7 @@ PAGE_SOURCES := $(shell find web/src web/public web/index.html web/vite.config.t
 # Node comes from requirements.lock, whatever else the machine has.
 NPM := PATH="$(CURDIR)/$(RUN):$$PATH" npm --prefix web
 DEMO_OUT ?= out/demo
-TEST_PROCESSES ?= 3
+TEST_PROCESSES ?= 4
 
 help:
 	@echo "make setup   install the pinned versions into $(VENV), and build the web pages"
