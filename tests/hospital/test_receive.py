@@ -16,6 +16,7 @@ import httpx
 import numpy as np
 import pytest
 from pydicom import Dataset, dcmread
+from pydicom.config import disable_value_validation
 from pydicom.dataset import FileMetaDataset
 from pydicom.encaps import encapsulate
 from pydicom.uid import UID, DeflatedExplicitVRLittleEndian, ExplicitVRLittleEndian, JPEGBaseline8Bit, generate_uid
@@ -27,6 +28,7 @@ from specimap_hospital.dicom.model import DicomObject
 from specimap_hospital.outbox.instances import take_stock
 from specimap_hospital.outbox.making import make_objects
 from specimap_hospital.outbox.rows import Claim, claim, request_set
+from specimap_hospital.receive.classes import CANNOT_PROCESS, CANNOT_UNDERSTAND
 from specimap_hospital.receive.listener import start_listener
 from specimap_infra.database import utc_now
 from tests.support.hospital_scene import KEY, PLANTED, as_json
@@ -238,6 +240,26 @@ def test_the_photos_of_a_study_become_an_acquisition(scene: Scene) -> None:
     other = stow(client, encoded(photograph(generate_uid(), 2), JPEGBaseline8Bit))
     assert other.status_code == 200
     assert len(client.get("/v1/acquisitions").json()["items"]) == len(before) + 2
+
+
+def test_photos_that_do_not_say_whose_they_are_or_name_two_patients_are_refused(scene: Scene) -> None:
+    client = scene.running.client(["upload", "read"])
+    before = len(client.get("/v1/acquisitions").json()["items"])
+    unknown = photograph("")
+    assert failures(stow(client, encoded(unknown, JPEGBaseline8Bit))) == [CANNOT_UNDERSTAND]
+    for patient in ("P" * 65, "P\\Q"):
+        unread = photograph(generate_uid(), 1)
+        with disable_value_validation():
+            unread.add_new("PatientID", "LO", patient)
+            content = encoded(unread, JPEGBaseline8Bit)
+        assert failures(stow(client, content)) == [CANNOT_UNDERSTAND], patient
+    assert len(client.get("/v1/acquisitions").json()["items"]) == before
+    study = generate_uid()
+    assert stow(client, encoded(photograph(study, 1), JPEGBaseline8Bit)).status_code == 200
+    other = photograph(study, 2)
+    other.PatientID = "SOMEBODY-ELSE"
+    assert failures(stow(client, encoded(other, JPEGBaseline8Bit))) == [CANNOT_PROCESS]
+    assert len(client.get("/v1/acquisitions").json()["items"]) == before + 1
 
 
 # ---- what is refused ----------------------------------------------------------------------------------

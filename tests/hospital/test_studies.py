@@ -15,16 +15,19 @@ from typer.testing import CliRunner
 
 from specimap_cli.app import app
 from specimap_core.errors import SettingsError
+from specimap_hospital.fhir.notices import add_notices
+from specimap_hospital.outbox.rows import add_wanted
 from specimap_infra.backup import create_backup
-from specimap_infra.database import Database
+from specimap_infra.database import Database, utc_now
 from specimap_infra.errors import StudySealedError
 from specimap_infra.settings import load_settings
-from specimap_infra.studies import find_study, put_study, rotate
+from specimap_infra.studies import find_study, put_study, rotate, study_keys
 from specimap_infra.study_context import StudyContext
 from specimap_infra.study_keys import StudyKeys, new_key
-from specimap_infra.tables import SealedStudy
+from specimap_infra.tables import CloudRow, SealedStudy
 from tests.support.hospital_scene import KEY, PATIENT, PLANTED, as_json
 from tests.support.job_scene import acquisition
+from tests.support.outbox_scene import waiting_cloud
 from tests.support.result_scene import put_result
 from tests.support.service_scene import Running, serving
 from tests.support.upload_scene import new_acquisition
@@ -56,6 +59,34 @@ def test_a_study_context_is_kept_changed_read_and_removed(hospital: Running) -> 
     assert client.delete(path).status_code == 204
     assert client.get(path).status_code == 404
     assert client.delete(path).status_code == 404
+
+
+def test_one_that_was_removed_and_entered_again_is_sent_and_told_anew(hospital: Running) -> None:
+    cloud_id = waiting_cloud(hospital)
+    database, keys = hospital.database, study_keys(hospital.settings)
+    assert add_wanted(database, utc_now(), automatic=True) == 1
+    assert add_notices(database, utc_now(), archived=False) == 1
+    with database.session() as session:
+        acquisition_id = session.get_one(CloudRow, cloud_id).acquisition_id
+        session.delete(session.get_one(SealedStudy, acquisition_id))
+    with database.session() as session:
+        put_study(session, keys, acquisition_id, PATIENT.model_copy(update={"patient_id": "OTHER"}), "key_test")
+    assert add_wanted(database, utc_now(), automatic=True) == 1
+    assert add_notices(database, utc_now(), archived=False) == 1
+
+
+def test_a_hold_keeps_it(hospital: Running) -> None:
+    client = hospital.client()
+    acquisition_id = new_acquisition(client)
+    path = path_of(acquisition_id)
+    assert client.put(path, json=as_json()).status_code == 200
+    assert client.put(f"/v1/acquisitions/{acquisition_id}/hold", json={"reason": "lawsuit-7"}).status_code == 201
+    other = as_json(PATIENT.model_copy(update={"patient_id": "OTHER"}))
+    for answer in (client.delete(path), client.put(path, json=other)):
+        assert (answer.status_code, answer.json()["code"]) == (409, "legal_hold")
+    assert client.put(path, json=as_json()).status_code == 200
+    assert client.delete(f"/v1/acquisitions/{acquisition_id}/hold").status_code == 204
+    assert client.delete(path).status_code == 204
 
 
 def test_it_goes_with_its_acquisition(hospital: Running) -> None:
