@@ -14,7 +14,8 @@ export type Permission =
   | "project.manage"
   | "result.read"
   | "service.watch"
-  | "share.manage";
+  | "share.manage"
+  | "study.manage";
 
 /** `undefined`: not known yet. `null`: nobody is signed in. */
 export const session = signal<Session | null | undefined>(undefined);

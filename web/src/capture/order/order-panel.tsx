@@ -15,7 +15,7 @@ export function OrderPanel({ acquisition }: { acquisition: string }) {
   const [orders, setOrders] = useState<Orders | null>(null);
   const [problem, setProblem] = useState<Problem | null>(null);
   const [busy, setBusy] = useState(false);
-  if (!may("upload")) return null;
+  if (!may("study.manage")) return null;
   const params = { path: { acquisition_id: acquisition } };
 
   const attempt = async (work: () => Promise<void>): Promise<void> => {
