@@ -66,6 +66,7 @@ class Result:
     report: Dataset
     """The structured report (TID 1500)."""
     instances: Sequence[SentInstance]
+    """Those that an archive has; without any there is no imaging study to refer to."""
     links: Sequence[str] = ()
     """Addresses at which a person finds the result."""
 
@@ -91,13 +92,10 @@ def transaction(context: StudyContext, result: Result, systems: Systems) -> Elem
     }
     if context.accession_number:
         about["basedOn"] = [service_request(context, systems)]
-    study = {"reference": urls["ImagingStudy"]}
-    of_observations = Shared(
-        report_uid,
-        about
-        | {"partOf": [study], "derivedFrom": [study]}
-        | {"device": {"reference": urls["Device"]}, "specimen": {"reference": urls["Specimen"]}},
-    )
+    studies = [{"reference": urls["ImagingStudy"]}] if result.instances else []
+    made_of = {"device": {"reference": urls["Device"]}, "specimen": {"reference": urls["Specimen"]}}
+    in_study: Element = {"partOf": studies, "derivedFrom": studies} if studies else {}
+    of_observations = Shared(report_uid, about | made_of | in_study)
     made, groups = observations(measurement_groups(result.report), of_observations)
     report: Element = {
         "resourceType": "DiagnosticReport",
@@ -106,7 +104,7 @@ def transaction(context: StudyContext, result: Result, systems: Systems) -> Elem
         "category": [{"coding": [_IMAGING]}],
         "code": {"coding": [_REPORT], "text": "Spectral map of a specimen's surface"},
         "specimen": [{"reference": urls["Specimen"]}],
-        "imagingStudy": [study],
+        **({"imagingStudy": studies} if studies else {}),
         "result": [{"reference": url} for url in groups],
         "conclusion": f"{result.verdict} {RESEARCH_USE}".strip(),
     }
@@ -114,9 +112,11 @@ def transaction(context: StudyContext, result: Result, systems: Systems) -> Elem
         report["presentedForm"] = [{"contentType": "text/html", "url": link} for link in result.links]
     specimen = _specimen(context, result, systems)
     device = _device(result)
-    entries = [
-        _create(urls["Specimen"], specimen, _token(specimen)),
-        _create(urls["ImagingStudy"], _imaging_study(context, result, systems), (DICOM_UID, oid(result.study_uid))),
+    entries = [_create(urls["Specimen"], specimen, _token(specimen))]
+    if studies:
+        found = _imaging_study(context, result, systems)
+        entries.append(_create(urls["ImagingStudy"], found, (DICOM_UID, oid(result.study_uid))))
+    entries += [
         _create(urls["Device"], device, _token(device)),
         *(_update(item.url, item.resource, (DICOM_UID, oid(item.uid))) for item in made),
         _update(full_url("DiagnosticReport", report_uid), report, (DICOM_UID, oid(report_uid))),

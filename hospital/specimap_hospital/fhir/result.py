@@ -64,7 +64,7 @@ def _told(
             item.sop_class_uid,
             str(dcmread(item.path, stop_before_pixels=True, specific_tags=["Modality"]).Modality),
         )
-        for item in made
+        for item in (made if settings.sends_dicom else ())
     ]
     judged = verdict(report)
     address = settings.public_url.rstrip("/")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from typing import Any
 from urllib.parse import unquote
 
@@ -72,6 +74,13 @@ def test_the_study_lists_the_instances_that_were_sent() -> None:
     assert study["identifier"] == [{"system": "urn:dicom:uid", "value": f"urn:oid:{STUDY}"}]
     assert study["numberOfInstances"] == 1
     assert study["series"][0]["instance"][0]["uid"] == "1.2.826.0.1.3680043.9.7.3"
+
+
+def test_without_an_archive_no_study_is_told_of() -> None:
+    bundle = transaction(CONTEXT, replace(result(), instances=[]), SYSTEMS)
+    assert "ImagingStudy" not in json.dumps(bundle)
+    assert len(resources(bundle, "Observation")) == 4
+    assert validated(bundle) == []
 
 
 def test_sent_again_a_bundle_finds_what_it_made() -> None:
