@@ -21,6 +21,7 @@ from specimap_infra.settings import ServiceSettings
 if TYPE_CHECKING:
     import requests
     from dicomweb_client.web import DICOMwebClient
+    from pydantic import SecretStr
     from pynetdicom import AE
     from pynetdicom.association import Association
 
@@ -94,7 +95,9 @@ def tls_context(settings: ServiceSettings) -> ssl.SSLContext:
 # ---- DICOMweb -----------------------------------------------------------------------------------------
 
 
-def dicomweb(settings: ServiceSettings, url: str, *, token: str, user: str, password: str, seconds: float) -> Any:
+def dicomweb(
+    settings: ServiceSettings, url: str, *, token: SecretStr, user: str, password: SecretStr, seconds: float
+) -> Any:
     """Make a client that connects to the host itself only: no proxy from the environment, no redirect, no repetition.
 
     An answer takes at most ``seconds``, and is at most 8 MiB long. Raises SettingsError.
@@ -122,10 +125,10 @@ def dicomweb(settings: ServiceSettings, url: str, *, token: str, user: str, pass
     session.trust_env = False
     session.max_redirects = 0
     session.mount("https://", Adapter())
-    if token:
-        session.headers["Authorization"] = f"Bearer {token}"
+    if bearer := token.get_secret_value():
+        session.headers["Authorization"] = f"Bearer {bearer}"
     elif user:
-        session.auth = HTTPBasicAuth(user.encode(), password.encode())
+        session.auth = HTTPBasicAuth(user.encode(), password.get_secret_value().encode())
     client: DICOMwebClient = DICOMwebClient(
         url, session=session, callback=_bounded(seconds), chunk_size=2**31 - 1, timeout=(min(seconds, 10.0), seconds)
     )

@@ -29,7 +29,7 @@ class Study:
 
 def study_keys(settings: ServiceSettings) -> StudyKeys:
     """Return the keys. Raises StudyKeysMissingError where none is set."""
-    keys = StudyKeys.of(settings.study_keys)
+    keys = StudyKeys.of_settings(settings)
     if not keys:
         raise StudyKeysMissingError(
             "No key to encrypt patient data with is set, so no study context is kept.",

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
+    from specimap_infra.settings import ServiceSettings
+
 KEY_BYTES = 32
 NONCE_BYTES = 12
 
@@ -70,6 +72,11 @@ class StudyKeys:
     def of(cls, texts: Sequence[str]) -> StudyKeys:
         """Read the keys. Raises KeyTextError."""
         return cls(tuple(StudyKey.of(text) for text in texts))
+
+    @classmethod
+    def of_settings(cls, settings: ServiceSettings) -> StudyKeys:
+        """The keys that the settings name, which have been read once before."""
+        return cls.of([key.get_secret_value() for key in settings.study_keys])
 
     def __bool__(self) -> bool:
         return bool(self.keys)

@@ -38,7 +38,7 @@ def started(settings: ServiceSettings, ahead: float) -> subprocess.Popen[str]:
         "STUDY_KEYS": f'["{KEY}"]',
         "PACS_URL": settings.pacs_url,
         "PACS_USER": settings.pacs_user,
-        "PACS_PASSWORD": settings.pacs_password,
+        "PACS_PASSWORD": settings.pacs_password.get_secret_value(),
     }
     return subprocess.Popen(
         [sys.executable, "-m", "tests.support.outbox_sender", str(ahead), str(OBJECTS)],

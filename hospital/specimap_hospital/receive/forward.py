@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from pydantic import SecretStr
+
 from specimap_hospital.connections import PeerError, dicomweb, web_errors
 from specimap_hospital.receive.classes import (
     CANNOT_PROCESS,
@@ -28,7 +30,9 @@ def forwarded(settings: ServiceSettings, dataset: Dataset) -> int:
     """Hand an object on. Returns the status for its sender: success, or why it was not taken."""
     host = f"[{settings.host}]" if ":" in settings.host else settings.host
     url = settings.dicom_forward_url or f"http://{host}:{settings.port}"
-    client = dicomweb(settings, f"{url}/v1/dicomweb", token=settings.dicom_key, user="", password="", seconds=SECONDS)
+    client = dicomweb(
+        settings, f"{url}/v1/dicomweb", token=settings.dicom_key, user="", password=SecretStr(""), seconds=SECONDS
+    )
     import requests
 
     try:

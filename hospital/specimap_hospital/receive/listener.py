@@ -51,7 +51,7 @@ def start_listener(database: Database, settings: ServiceSettings) -> Callable[[]
     ae.require_called_aet = True
     ae.require_calling_aet = titles
     ae.add_supported_context(VERIFICATION)
-    if settings.dicom_key:
+    if settings.dicom_key.get_secret_value():
         for sop_class in SEGMENTATIONS:
             ae.add_supported_context(sop_class, list(PLAIN))
         for sop_class in PHOTOS:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, Field, field_validator
+from pydantic import BaseModel, Field, SecretStr, field_validator
 
 from specimap_infra.study_keys import KeyTextError, StudyKey
 
@@ -12,16 +12,16 @@ from specimap_infra.study_keys import KeyTextError, StudyKey
 class StudySettings(BaseModel):
     """Study contexts."""
 
-    study_keys: list[str] = Field(
+    study_keys: list[SecretStr] = Field(
         default_factory=list,
         description="Keys that patient data are encrypted with, as a JSON list, the newest first; without one no study context is kept. `specimap contexts new-key` makes one.",
     )
 
     @field_validator("study_keys")
     @classmethod
-    def _readable_keys(cls, value: list[str]) -> list[str]:
+    def _readable_keys(cls, value: list[SecretStr]) -> list[SecretStr]:
         try:
-            keys = [StudyKey.of(text) for text in value]
+            keys = [StudyKey.of(text.get_secret_value()) for text in value]
         except KeyTextError:
             # The value is a secret, and the message of a wrong setting is logged.
             raise ValueError("each is 32 random bytes in base64, as specimap contexts new-key makes them") from None
@@ -49,17 +49,17 @@ class HospitalSettings(StudySettings):
         default="",
         description="DICOMweb address (QIDO-RS) whose studies are looked up as orders, besides the worklist.",
     )
-    orders_token: str = Field(default="", description="Bearer token for it.")
+    orders_token: SecretStr = Field(default=SecretStr(""), description="Bearer token for it.")
     orders_user: str = Field(default="", description="User for it, where it takes a password.")
-    orders_password: str = Field(default="", description="The user's password.")
+    orders_password: SecretStr = Field(default=SecretStr(""), description="The user's password.")
     orders_seconds: float = Field(default=10, gt=0, le=60, description="Longest time that an order is looked up.")
 
     pacs_url: str = Field(
         default="", description="DICOMweb address that results are sent to (STOW-RS); nothing is sent by default."
     )
-    pacs_token: str = Field(default="", description="Bearer token for it.")
+    pacs_token: SecretStr = Field(default=SecretStr(""), description="Bearer token for it.")
     pacs_user: str = Field(default="", description="User for it, where it takes a password.")
-    pacs_password: str = Field(default="", description="The user's password.")
+    pacs_password: SecretStr = Field(default=SecretStr(""), description="The user's password.")
     pacs_host: str = Field(
         default="",
         description="Host of the archive's DICOM port: for C-STORE, where no `SPECIMAP_PACS_URL` is set or it does not answer, and for its commitment.",
@@ -97,8 +97,8 @@ class HospitalSettings(StudySettings):
         description="Application entity titles that may use the DICOM port besides the archive's, as a JSON list.",
     )
 
-    dicom_key: str = Field(
-        default="",
+    dicom_key: SecretStr = Field(
+        default=SecretStr(""),
         description="Key (`spk_...`) with the scopes `upload` and `label` with which the DICOM port hands on what it is sent by C-STORE; without one it takes nothing.",
     )
     dicom_forward_url: str = Field(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from pydantic import BaseModel, Field, ValidationInfo, field_validator
+from pydantic import BaseModel, Field, SecretStr, ValidationInfo, field_validator
 
 PERSON_ROLES = ("technician", "clinician", "classifier", "admin", "auditor")
 """Roles of people who sign in with an identity provider; the service's table of permissions says what each may."""
@@ -20,9 +20,8 @@ class IdentitySettings(BaseModel):
         default="",
         description="Address of the identity provider, as it calls itself; without one nobody signs in with it. Needs `SPECIMAP_OIDC_CLIENT_ID` and `SPECIMAP_PUBLIC_URL`.",
     )
-    oidc_client_secret: str = Field(
-        default="",
-        repr=False,
+    oidc_client_secret: SecretStr = Field(
+        default=SecretStr(""),
         description="Secret of Specimap at the provider; empty for a public client, which PKCE alone protects.",
     )
     oidc_name: str = Field(

@@ -185,7 +185,7 @@ class Intake:
 
     def _check_patient(self, session: Session, acquisition_id: str, study: dict[str, Any] | None) -> None:
         """Raise UnreadableError where a study's photo names another patient than those before it."""
-        keys = StudyKeys.of(self.context.settings.study_keys)
+        keys = StudyKeys.of_settings(self.context.settings)
         known = find_study(session, keys, acquisition_id) if keys else None
         if known is not None and study is not None and study.get("patient_id") != known.context.patient_id:
             raise UnreadableError(CANNOT_PROCESS)
@@ -206,7 +206,7 @@ class Intake:
         session.add(ReceivedStudy(digest=digest, acquisition_id=row.id))
         audit(session, self.principal.key_id, "acquisition.create", row.id)
         session.flush()
-        keys = StudyKeys.of(self.context.settings.study_keys)
+        keys = StudyKeys.of_settings(self.context.settings)
         if keys and study is not None and session.get(SealedStudy, row.id) is None:
             try:
                 context = StudyContext.model_validate(study)

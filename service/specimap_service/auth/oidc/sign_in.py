@@ -161,7 +161,7 @@ def _exchanged(identity: Identity, description: Description, code: str, verifier
     settings = identity.settings
     offered = description.says("token_endpoint_auth_methods_supported") or ["client_secret_basic"]
     method = "none"
-    if settings.oidc_client_secret:
+    if settings.oidc_client_secret.get_secret_value():
         method = "client_secret_basic" if "client_secret_basic" in offered else "client_secret_post"
     body = prepare_token_request(
         "authorization_code",
@@ -169,7 +169,7 @@ def _exchanged(identity: Identity, description: Description, code: str, verifier
         redirect_uri=identity.page_address(CALLBACK),
         code_verifier=verifier,
     )
-    auth = ClientAuth(settings.oidc_client_id, settings.oidc_client_secret, method)
+    auth = ClientAuth(settings.oidc_client_id, settings.oidc_client_secret.get_secret_value(), method)
     address, headers, body = auth.prepare("POST", description.address("token_endpoint"), dict(FORM), body)
     status, found = ask(identity.client, "POST", address, content=body, headers=headers)
     if status != 200 and status < 500:
