@@ -14,6 +14,7 @@ import sqlalchemy as sa
 
 from specimap_core.errors import SettingsError
 from specimap_core.json_text import json_text
+from specimap_infra.claims import take_due, wait_seconds
 from specimap_infra.database import Database, utc_now
 from specimap_infra.job_schemas import job_views
 from specimap_infra.logs import logger
@@ -25,7 +26,8 @@ DELIVERY = "X-Specimap-Delivery"
 TIMEOUT_SECONDS = 10.0
 CLAIM = datetime.timedelta(seconds=90)
 """How long a delivery belongs to the worker that sends it; if that one died, it is due again afterwards."""
-LONGEST_WAIT_SECONDS = 900
+FIRST_WAIT_SECONDS = 2.0
+LONGEST_WAIT_SECONDS = 900.0
 MOST_AT_ONCE = 50
 LARGEST_BODY = 256 * 1024
 
@@ -112,26 +114,16 @@ def seconds_to_next(database: Database, most: float) -> float:
 def _claim(database: Database, now: datetime.datetime) -> _Claimed | None:
     due = sa.and_(Delivery.state == "pending", Delivery.next_at <= now)
     while True:
+        row = take_due(database, Delivery, due, next_at=utc_now() + CLAIM)
+        if row is None:
+            return None
         with database.session() as session:
-            row = session.scalars(
-                sa.select(Delivery).where(due).order_by(Delivery.next_at).limit(1).with_for_update(skip_locked=True)
-            ).first()
-            if row is None:
-                return None
-            # SQLite locks no row that is read: the first worker to change it has it.
-            taken = session.execute(
-                sa.update(Delivery)
-                .where(Delivery.id == row.id, Delivery.attempts == row.attempts, due)
-                .values(attempts=row.attempts + 1, next_at=utc_now() + CLAIM)
-                .returning(Delivery.attempts),
-                execution_options={"synchronize_session": False},
-            ).scalar()
             job = session.get(Job, row.job_id)
-            if taken is None or job is None:
-                continue
+            if job is None:
+                continue  # deleted meanwhile, and the row with it
             (view,) = job_views(session, [job])
-            webhook = job.webhook or {}
-            return _Claimed(row.id, taken, webhook["url"], webhook["secret"], view.model_dump(mode="json"))
+        webhook = job.webhook or {}
+        return _Claimed(row.id, row.attempts, webhook["url"], webhook["secret"], view.model_dump(mode="json"))
 
 
 def _send(claimed: _Claimed, settings: ServiceSettings, client: httpx.Client) -> tuple[str, bool]:
@@ -160,7 +152,7 @@ def _record_attempt(
 ) -> None:
     last = claimed.attempt >= settings.webhook_attempts
     state = "delivered" if delivered else "given_up" if last else "pending"
-    wait = datetime.timedelta(seconds=min(2.0**claimed.attempt, LONGEST_WAIT_SECONDS))
+    wait = datetime.timedelta(seconds=wait_seconds(claimed.attempt, FIRST_WAIT_SECONDS, LONGEST_WAIT_SECONDS))
     with database.session() as session:
         session.execute(
             # If another worker has sent it meanwhile, its result counts.

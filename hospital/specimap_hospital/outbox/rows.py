@@ -13,6 +13,8 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.orm import Session
 
+from specimap_core.errors import NotFoundError
+from specimap_infra.claims import take_due
 from specimap_infra.database import Database, rows_changed
 from specimap_infra.errors import StudyMissingError
 from specimap_infra.ids import new_id
@@ -22,7 +24,6 @@ from specimap_infra.tables import CloudRow, DicomInstance, DicomSet, Job, Sealed
 AUTOMATIC = "service"
 """Stands for the key of what nobody asked for."""
 MOST_AT_ONCE = 100
-FIRST_WAIT_SECONDS = 5.0
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,11 @@ def add_wanted(database: Database, now: datetime.datetime, *, automatic: bool) -
         clouds = set(session.scalars(changed)) | (set(session.scalars(lacking)) if automatic else set())
     for cloud_id in sorted(clouds):
         with database.session() as session:
-            version = _lock_and_find_version(session, cloud_id)
+            try:
+                lock_cloud(session, cloud_id)
+            except NotFoundError:
+                continue
+            version = _study_version(session, cloud_id)
             if version is None:
                 continue
             rows = session.scalars(sa.select(DicomSet).where(DicomSet.cloud_id == cloud_id)).all()
@@ -100,14 +105,6 @@ def add_wanted(database: Database, now: datetime.datetime, *, automatic: bool) -
             if automatic and not any(row.first for row in rows):
                 session.add(_new_set(cloud_id, {}, version, AUTOMATIC, now))
     return len(clouds)
-
-
-def _lock_and_find_version(session: Session, cloud_id: str) -> int | None:
-    locked = session.execute(
-        sa.update(CloudRow).where(CloudRow.id == cloud_id).values(points=CloudRow.points).returning(CloudRow.id),
-        execution_options={"synchronize_session": False},
-    )
-    return None if locked.first() is None else _study_version(session, cloud_id)
 
 
 def _study_version(session: Session, cloud_id: str) -> int | None:
@@ -152,23 +149,10 @@ def claim(
     Raises DatabaseUnavailableError.
     """
     due = sa.and_(DicomSet.state.in_(states), DicomSet.next_at <= now, DicomSet.held_until <= now)
-    while True:
-        with database.session() as session:
-            row = session.scalars(
-                sa.select(DicomSet).where(due).order_by(DicomSet.next_at).limit(1).with_for_update(skip_locked=True)
-            ).first()
-            if row is None:
-                return None
-            # SQLite locks no row that is read: the first sender to change it has it.
-            taken = session.execute(
-                sa.update(DicomSet)
-                .where(DicomSet.id == row.id, DicomSet.attempts == row.attempts, due)
-                .values(attempts=row.attempts + 1, holder=holder, held_until=now + lease),
-                execution_options={"synchronize_session": False},
-            )
-            if rows_changed(taken):
-                options, version, state = row.options, row.study_version, row.state
-                return Claim(row.id, row.cloud_id, options, version, state, row.attempts + 1, holder, row.reason)
+    row = take_due(database, DicomSet, due, holder=holder, held_until=now + lease)
+    if row is None:
+        return None
+    return Claim(row.id, row.cloud_id, row.options, row.study_version, row.state, row.attempts, holder, row.reason)
 
 
 def renew(database: Database, held: Claim, until: datetime.datetime) -> bool:
@@ -204,8 +188,3 @@ def current(held: Claim) -> sa.ColumnElement[bool]:
         DicomSet.attempts == held.attempt,
         DicomSet.study_version == held.study_version,
     )
-
-
-def wait_seconds(attempt: int, longest: float) -> float:
-    """How long to wait after an attempt: 5 s, then twice as long each time, up to ``longest``."""
-    return float(min(FIRST_WAIT_SECONDS * 2.0 ** min(attempt - 1, 30), longest))

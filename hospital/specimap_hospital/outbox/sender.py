@@ -22,9 +22,10 @@ from specimap_hospital.outbox.archive import Archive, open_archive
 from specimap_hospital.outbox.commitment import ask_for_commitment
 from specimap_hospital.outbox.instances import ClaimLostError, Known, begin, counted, settle, take_stock
 from specimap_hospital.outbox.making import make_objects
-from specimap_hospital.outbox.rows import Claim, add_wanted, claim, finish, renew, wait_seconds
+from specimap_hospital.outbox.rows import Claim, add_wanted, claim, finish, renew
 from specimap_hospital.outbox.trail import note_end
 from specimap_hospital.outbox.workspaces import workspace
+from specimap_infra.claims import wait_seconds
 from specimap_infra.database import Database, utc_now
 from specimap_infra.errors import (
     DatabaseUnavailableError,
@@ -46,6 +47,7 @@ PASSING = (StorageUnavailableError, StorageFullError, StudyKeysMissingError, Stu
 TRIED_AGAIN = (WorkerCrashedError, StageTimeoutError)
 """What may be the set's own fault: tried a few times."""
 MOST_CRASHES = 5
+FIRST_WAIT_SECONDS = 5.0
 
 Make = Callable[[Claim, Path, Callable[[], bool]], list[DicomObject]]
 
@@ -179,7 +181,7 @@ class Sender:
         if held.attempt >= self._settings.pacs_attempts and not now:
             self._end(held, "failed", reason)
             return
-        wait = 0.0 if now else wait_seconds(held.attempt, self._settings.pacs_longest_wait_seconds)
+        wait = 0.0 if now else wait_seconds(held.attempt, FIRST_WAIT_SECONDS, self._settings.pacs_longest_wait_seconds)
         at = self._clock()
         # An attempt that was broken off from here is none.
         counted = {"attempts": held.attempt - 1} if now else {}
